@@ -1,0 +1,96 @@
+"""Subgoal spaces: what the high level may ask for and when it counts as reached. NumPy only."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.floating[Any]]
+GoalObservation = Mapping[str, NDArray[Any]]
+"""A goal environment's observation: ``observation``, ``achieved_goal``, ``desired_goal``, single or batched."""
+
+
+class SubgoalSpace:
+    """The box of subgoals of a task, the map from observations into it, and the test for having reached one.
+
+    All methods take single observations or batches (any leading dimensions, kept in the result).
+
+    :param low: lower bounds of a subgoal, in task units, shape ``(subgoal_dim,)``
+    :param high: upper bounds, same shape
+    :param thresholds: largest distance that counts as reached, one per entry of ``groups``, in task units
+    :param achieved: maps a goal observation to the subgoal-space point it lies at, ``(..., subgoal_dim)``
+    :param local: maps a goal observation to what the low level sees of it, ``(..., local_dim)``
+    :param local_scale: fixed task scales that bring ``local`` to about [-1, 1], shape ``(local_dim,)``
+    :param names: a name for each coordinate
+    :param groups: coordinate groups whose Euclidean distance is compared with a threshold; by default each
+        coordinate is a group of its own
+    :raises ValueError: if bounds, thresholds and groups do not fit together
+    """
+
+    def __init__(
+        self,
+        low: ArrayLike,
+        high: ArrayLike,
+        thresholds: ArrayLike,
+        achieved: Callable[[GoalObservation], FloatArray],
+        local: Callable[[GoalObservation], FloatArray],
+        local_scale: ArrayLike,
+        names: Sequence[str],
+        groups: Sequence[Sequence[int]] | None = None,
+    ) -> None:
+        self.low = np.asarray(low, dtype=np.float64)
+        self.high = np.asarray(high, dtype=np.float64)
+        self.thresholds = np.asarray(thresholds, dtype=np.float64)
+        self.local_scale = np.asarray(local_scale, dtype=np.float64)
+        self.names = tuple(names)
+        self.groups = tuple(tuple(g) for g in groups) if groups is not None else tuple((i,) for i in range(len(self.low)))
+        self._achieved = achieved
+        self._local = local
+        self._check()
+
+    def _check(self) -> None:
+        if self.low.ndim != 1 or self.low.shape != self.high.shape or not np.all(self.low < self.high):
+            raise ValueError(f"subgoal bounds must be two vectors with low < high, got low={self.low}, high={self.high}")
+        if len(self.names) != self.dim:
+            raise ValueError(f"{self.dim} subgoal coordinates need as many names, got {self.names}")
+        if self.thresholds.shape != (len(self.groups),) or not np.all(self.thresholds > 0):
+            raise ValueError(f"need one positive threshold per group {self.groups}, got {self.thresholds}")
+        if sorted(i for g in self.groups for i in g) != list(range(self.dim)):
+            raise ValueError(f"groups must use each of the {self.dim} coordinates once, got {self.groups}")
+
+    @property
+    def dim(self) -> int:
+        """Number of subgoal coordinates."""
+        return len(self.low)
+
+    @property
+    def local_dim(self) -> int:
+        """Number of entries of the low level's view of the task."""
+        return len(self.local_scale)
+
+    def achieved(self, observation: GoalObservation) -> FloatArray:
+        """Subgoal-space point of a goal observation, ``(..., subgoal_dim)``, task units."""
+        return self._achieved(observation)
+
+    def local(self, observation: GoalObservation) -> FloatArray:
+        """The low level's view of a goal observation, ``(..., local_dim)``, task units."""
+        return self._local(observation)
+
+    def reached(self, achieved: FloatArray, subgoal: FloatArray) -> NDArray[np.bool_]:
+        """Whether ``achieved`` lies within the thresholds of ``subgoal`` (strictly, as HiTS and HAC test), ``(...)``."""
+        difference = achieved - subgoal
+        if len(self.groups) == self.dim:
+            return np.asarray((np.abs(difference) < self.thresholds).all(axis=-1))
+        distances = np.stack([np.linalg.norm(difference[..., list(g)], axis=-1) for g in self.groups], axis=-1)
+        return np.asarray((distances < self.thresholds).all(axis=-1))
+
+    def scale(self, subgoal: FloatArray) -> FloatArray:
+        """From task units to [-1, 1] coordinates."""
+        return np.asarray(2.0 * (subgoal - self.low) / (self.high - self.low) - 1.0)
+
+    def unscale(self, unit: FloatArray) -> FloatArray:
+        """From [-1, 1] coordinates to task units."""
+        return np.asarray(self.low + 0.5 * (unit + 1.0) * (self.high - self.low))

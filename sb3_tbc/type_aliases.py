@@ -1,0 +1,24 @@
+"""Named tuples that cross the borders between modules."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch as th
+
+
+class LevelBatch(NamedTuple):
+    """A replay sample of one level; leading dimensions ``(batch,)`` or ``(gradient_steps, batch)``, float32.
+
+    ``states`` are the membrane potentials an NDBC actor started the step from (width 0 for an MLP actor);
+    ``discounts`` is gamma per transition (gamma**duration on the high level), not yet multiplied by ``1 - dones``.
+    """
+
+    observations: th.Tensor
+    actions: th.Tensor
+    next_observations: th.Tensor
+    rewards: th.Tensor  # (..., 1)
+    dones: th.Tensor  # (..., 1)
+    discounts: th.Tensor  # (..., 1)
+    states: th.Tensor  # (..., state_dim)
+    next_states: th.Tensor  # (..., state_dim)
