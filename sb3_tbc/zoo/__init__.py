@@ -1,0 +1,1 @@
+"""Configurations, run folders and the results ledger: what stands behind the commands."""

@@ -1,0 +1,150 @@
+"""Reading configurations: default -> task -> tuned -> command line, merged deeply, checked, never evaluated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.zoo.schema import RUN, SECTION, coerce, nearest, validate
+
+CONFIGS = ("paper", "tuned")
+ABLATIONS: dict[str, dict[str, Any]] = {}
+"""Ablation name -> what it overrides, merged after the task's section."""
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Everything that decides a run apart from its seed.
+
+    :param algo: algorithm, e.g. ``tbc-hrl``
+    :param task: short task name or environment id
+    :param config: ``paper`` (the tables' values) or ``tuned``
+    :param n_timesteps: environment steps
+    :param n_envs: parallel environments
+    :param env_kwargs: for ``gymnasium.make``
+    :param model: for the algorithm's constructor
+    """
+
+    algo: str
+    task: str
+    config: str
+    n_timesteps: int
+    n_envs: int = 1
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    model: dict[str, Any] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """As plain data for ``config.yml``."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
+        """Back from ``config.yml``.
+
+        :raises ConfigError: if keys are missing or unknown
+        """
+        try:
+            return cls(**data)
+        except TypeError as error:
+            raise ConfigError(f"not a run's config.yml: {error}") from error
+
+
+def merge(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+    """``base`` with ``change`` laid over it, section by section; a ``None`` replaces a whole section."""
+    result = dict(base)
+    for key, value in change.items():
+        old = result.get(key)
+        result[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def config_file(algo: str) -> Path:
+    """The shipped configuration file of an algorithm.
+
+    :raises ConfigError: if there is none
+    """
+    folder = Path(str(resources.files("sb3_tbc.zoo_configs")))
+    path = folder / f"{algo}.yml"
+    if not path.is_file():
+        raise ConfigError(
+            f"no configuration for algorithm {algo!r}; {nearest(algo, (p.stem for p in folder.glob('*.yml')))}"
+        )
+    return path
+
+
+def read_file(path: Path) -> dict[str, dict[str, Any]]:
+    """Read a configuration file and check all its sections.
+
+    :raises ConfigError: if it cannot be read or holds an unknown key or a wrong value
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"cannot read configuration {path}: {error}") from error
+    if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
+        raise ConfigError(f"{path}: expected sections of keys (default and one per task)")
+    schema = {**SECTION, "tuned": SECTION}
+    return {name: validate(coerce(section), schema, f"{path.name}, section {name}") for name, section in data.items()}
+
+
+def parse_overrides(items: Sequence[str]) -> dict[str, Any]:
+    """Command-line settings: ``["low.learning_rate:1e-3"]`` gives ``{"low": {"learning_rate": 0.001}}``.
+
+    :raises ConfigError: for a malformed item, an unknown key or a value of the wrong kind
+    """
+    result: dict[str, Any] = {}
+    for item in items:
+        name, separator, text = item.partition(":")
+        if not separator or not name:
+            raise ConfigError(
+                f"--hyperparams takes key:value with dots for sections, e.g. low.gamma:0.98; got {item!r}"
+            )
+        try:
+            value: Any = yaml.safe_load(text)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"--hyperparams {item!r}: the value is not YAML") from error
+        for key in reversed(name.split(".")):
+            value = {key: value}
+        result = merge(result, value)
+    return validate(coerce(result), SECTION, "--hyperparams")
+
+
+def load_config(
+    algo: str,
+    task: str,
+    config: str | None = None,
+    overrides: Mapping[str, Any] | None = None,
+    ablation: str | None = None,
+    path: Path | None = None,
+) -> RunConfig:
+    """The configuration of one run.
+
+    :param algo: algorithm name, which is also the name of the shipped file
+    :param task: section to use; an environment without a section runs on the defaults
+    :param config: ``paper``, ``tuned``, or ``None`` for ``tuned`` where there is such a sub-section
+    :param overrides: what the command line changes, as :func:`parse_overrides` gives it
+    :param ablation: name of an ablation
+    :param path: another configuration file
+    :raises ConfigError: for unknown names and wrong values
+    """
+    sections = read_file(path or config_file(algo))
+    default, section = dict(sections.get("default", {})), dict(sections.get(task, {}))
+    tuned = merge(default.pop("tuned", {}), section.pop("tuned", {}))
+    config = config or ("tuned" if tuned else "paper")
+    if config not in CONFIGS:
+        raise ConfigError(f"configuration must be one of {', '.join(CONFIGS)}, got {config!r}")
+    if ablation is not None and ablation not in ABLATIONS:
+        raise ConfigError(f"no ablation {ablation!r}; {nearest(ablation, ABLATIONS) if ABLATIONS else 'none yet'}")
+    merged = merge(default, section)
+    for change in (tuned if config == "tuned" else {}, ABLATIONS.get(ablation or "", {}), overrides or {}):
+        merged = merge(merged, change)
+    run = {key: merged.pop(key) for key in RUN if merged.get(key) is not None}
+    if run.get("n_timesteps", 0) <= 0 or run.get("n_envs", 1) <= 0:
+        raise ConfigError(f"n_timesteps and n_envs must be positive, got {run}")
+    return RunConfig(algo=algo, task=task, config=config, model=merged, **run)

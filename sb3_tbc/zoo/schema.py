@@ -1,0 +1,120 @@
+"""What a configuration may contain: the names and types of every key, in one place."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from sb3_tbc.errors import ConfigError
+
+Schema = dict[str, Any]
+"""Key -> kind: a type, a tuple of types, a frozenset of allowed strings, or a nested schema (``None`` allowed)."""
+
+NUMBER = (int, float)
+_FLOAT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+
+NDBC: Schema = {
+    **dict.fromkeys(("inter", "command", "motor", "sensory_fanout", "inter_fanout"), int),
+    **dict.fromkeys(("recurrent_command_synapses", "motor_fanin", "seed", "sub_steps"), int),
+    "dynamics": str,
+    "input_scale": list,
+}
+POLICY: Schema = {
+    "net_arch": (list, dict),
+    "negative_critic": bool,
+    "mean_bound": NUMBER,
+    "log_std_bounds": list,
+    "ndbc": NDBC,
+}
+LEVEL: Schema = {
+    "learning_rate": NUMBER,
+    "batch_size": int,
+    "gamma": NUMBER,
+    "tau": NUMBER,
+    "ent_coef": (int, float, str),
+    "target_entropy": (int, float, str),
+    "buffer_size": int,
+    "n_hindsight_goals": int,
+    "policy_kwargs": POLICY,
+}
+RUN: Schema = {"n_timesteps": int, "n_envs": int, "env_kwargs": dict}
+"""Keys the runner reads itself; all others go to the algorithm's constructor."""
+
+MODEL: Schema = {
+    "policy": str,
+    "max_options": int,
+    "window_end": frozenset({"timed", "reached"}),
+    "dt_min": NUMBER,
+    "dt_max": NUMBER,
+    "target": frozenset({"smdp", "decision"}),
+    "decision_cost": NUMBER,
+    "duration_cost": NUMBER,
+    "testing_fraction": NUMBER,
+    "deterministic_testing": bool,
+    "random_fraction": NUMBER,
+    "n_hindsight_goals": int,
+    "gradient_ratio": NUMBER,
+    "learning_starts": int,
+    "memory": frozenset({"window", "episode", "none"}),
+    "compile": (bool, str),
+    "high": LEVEL,
+    "low": LEVEL,
+}
+SECTION: Schema = {**RUN, **MODEL}
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """A hint that names the closest valid name, or lists them all when none is close."""
+    known = sorted(names)
+    lowered = {k.lower(): k for k in known}
+    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+    return f"did you mean {lowered[close[0]]!r}?" if close else f"known: {', '.join(known)}"
+
+
+def coerce(value: Any) -> Any:
+    """Turn number-like strings into numbers, recursively: YAML 1.1 reads ``3e-4`` as text."""
+    if isinstance(value, Mapping):
+        return {key: coerce(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [coerce(item) for item in value]
+    if isinstance(value, str) and _FLOAT.fullmatch(value.strip()):
+        return float(value)
+    return value
+
+
+def validate(section: Mapping[str, Any], schema: Schema, where: str) -> dict[str, Any]:
+    """Check every key and value of a section and return it with whole floats as integers where those are asked for.
+
+    :param section: what was read, numbers already coerced
+    :param schema: the allowed keys and kinds
+    :param where: file and section, for messages
+    :raises ConfigError: for an unknown key or a value of the wrong kind
+    """
+    result = {}
+    for key, value in section.items():
+        if key not in schema:
+            raise ConfigError(f"{where}: unknown key {key!r}; {nearest(str(key), schema)}")
+        result[key] = _value(value, schema[key], f"{where}: {key}")
+    return result
+
+
+def _value(value: Any, kind: Any, where: str) -> Any:
+    if value is None:
+        return None
+    if isinstance(kind, dict):
+        if not isinstance(value, Mapping):
+            raise ConfigError(f"{where} must be a section with keys {', '.join(sorted(kind))}, got {value!r}")
+        return validate(value, kind, where)
+    if isinstance(kind, frozenset):
+        if value not in kind:
+            raise ConfigError(f"{where} must be one of {', '.join(sorted(kind))}, got {value!r}")
+        return value
+    kinds = kind if isinstance(kind, tuple) else (kind,)
+    if kinds == (int,) and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        names = " or ".join(k.__name__ for k in kinds)
+        raise ConfigError(f"{where} must be {names}, got {value!r} ({type(value).__name__})")
+    return value

@@ -1,0 +1,146 @@
+"""Configurations: merging, checking, and every value against the paper's tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.zoo.config import RunConfig, config_file, load_config, merge, parse_overrides, read_file
+
+TABLES = yaml.safe_load((Path(__file__).parent / "data" / "paper_tables.yaml").read_text())
+TASKS = sorted(TABLES["table_1_environments"])
+COLUMN = {"tbc-hrl": "TBC-HRL", "hits": "HiTS"}
+
+
+def entropy(value: Any) -> Any:
+    """Table A2's ``target`` is automatic temperature."""
+    return "auto" if isinstance(value, str) and value.startswith(("auto", "target")) else value
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algo", sorted(COLUMN))
+def test_paper_configuration_is_table_a2(algo: str, task: str) -> None:
+    row = TABLES["table_a2_hyperparameters"][COLUMN[algo]][task]
+    run = load_config(algo, task, "paper")
+    assert run.n_timesteps == TABLES["table_1_environments"][task]["training_steps"]
+    assert run.model["max_options"] == row["max_actions"]
+    assert run.model["dt_max"] == row["dt_max"]
+    assert run.model["n_hindsight_goals"] == row["hindsight"]
+    for level, alpha in zip(("low", "high"), row["alpha"], strict=True):
+        settings = run.model[level]
+        assert settings["learning_rate"] == float(row["lr"])
+        assert settings["batch_size"] == row["batch"]
+        assert settings["tau"] == float(row["polyak"])
+        assert entropy(settings["ent_coef"]) == entropy(alpha)
+        assert "n_hindsight_goals" not in settings
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_wiring_is_table_a1(task: str) -> None:
+    for config in ("paper", "tuned"):
+        ndbc = load_config("tbc-hrl", task, config).model["low"]["policy_kwargs"]["ndbc"]
+        assert {k: ndbc[k] for k in TABLES["table_a1_ndbcnet"][task]} == TABLES["table_a1_ndbcnet"][task]
+
+
+def test_paper_reading_of_the_window_end() -> None:
+    assert load_config("tbc-hrl", "Pendulum", "paper").model["window_end"] == "reached"
+    assert load_config("hits", "Pendulum", "paper").model["window_end"] == "timed"
+    assert load_config("hits", "Pendulum").model["low"]["policy_kwargs"]["ndbc"] is None
+
+
+def test_tuned_is_the_default_where_it_exists() -> None:
+    assert load_config("tbc-hrl", "Pendulum").config == "tuned"
+    assert load_config("hits", "UR5Reacher").config == "paper"
+    assert load_config("tbc-hrl", "Pendulum") == load_config("tbc-hrl", "Pendulum", "tuned")
+
+
+def test_deep_merge_keeps_sisters() -> None:
+    base = {"low": {"gamma": 0.99, "policy_kwargs": {"net_arch": [3], "ndbc": {"inter": 2}}}, "n": 1}
+    change = {"low": {"tau": 0.1, "policy_kwargs": {"ndbc": None}}}
+    expected = {"low": {"gamma": 0.99, "tau": 0.1, "policy_kwargs": {"net_arch": [3], "ndbc": None}}, "n": 1}
+    assert merge(base, change) == expected
+    assert base["low"]["policy_kwargs"] == {"net_arch": [3], "ndbc": {"inter": 2}}
+
+
+def test_order_default_task_tuned_command_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.yml"
+    path.write_text(
+        "default: {n_timesteps: 10, dt_min: 1, low: {gamma: 0.9, tau: 0.1}, tuned: {dt_min: 2}}\n"
+        "T: {low: {gamma: 0.8}, tuned: {low: {gamma: 0.7}}}\n"
+    )
+    paper = load_config("x", "T", "paper", path=path)
+    assert paper.model == {"dt_min": 1, "low": {"gamma": 0.8, "tau": 0.1}}
+    tuned = load_config("x", "T", path=path, overrides=parse_overrides(["low.tau:5e-1", "n_timesteps:2e1"]))
+    assert tuned.model == {"dt_min": 2, "low": {"gamma": 0.7, "tau": 0.5}}
+    assert tuned.n_timesteps == 20
+    assert isinstance(tuned.n_timesteps, int)
+    assert load_config("x", "AnotherEnv-v0", "paper", path=path).model["dt_min"] == 1
+
+
+def test_number_like_strings_become_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "a.yml"
+    path.write_text("T: {n_timesteps: 1e3, low: {learning_rate: 3e-4, ent_coef: auto_0.1, batch_size: 1e2}}\n")
+    low = load_config("x", "T", path=path).model["low"]
+    assert low == {"learning_rate": 3e-4, "ent_coef": "auto_0.1", "batch_size": 100}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "T: {low: {lerning_rate: 1}}",
+            r"a\.yml, section T: low: unknown key 'lerning_rate'; did you mean 'learning_rate'",
+        ),
+        ("T: {max_option: 1}", r"a\.yml, section T: unknown key 'max_option'; did you mean 'max_options'"),
+        ("T: {tuned: {dt_mim: 1}}", r"tuned: unknown key 'dt_mim'; did you mean 'dt_min'"),
+        ("T: {window_end: soon}", r"window_end must be one of reached, timed, got 'soon'"),
+        ("T: {low: {batch_size: 1.5}}", r"batch_size must be int, got 1\.5"),
+        ("T: {low: {gamma: true}}", r"gamma must be int or float, got True"),
+        ("T: {low: 3}", r"low must be a section"),
+        ("T: 3", r"expected sections"),
+        ("T: {a: [}", r"cannot read configuration"),
+        ("T: {n_timesteps: 0}", r"n_timesteps and n_envs must be positive"),
+    ],
+)
+def test_mistakes_name_file_section_and_cure(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "a.yml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_config("x", "T", path=path)
+
+
+def test_command_line_values_are_data_not_code() -> None:
+    assert parse_overrides(["low.policy_kwargs.net_arch:[64, 64]", "compile:false"]) == {
+        "low": {"policy_kwargs": {"net_arch": [64, 64]}},
+        "compile": False,
+    }
+    for item in ("low.gamma:__import__('os').getcwd()", "low.gamma:!!python/object/apply:os.getcwd []"):
+        with pytest.raises(ConfigError):
+            parse_overrides([item])
+    with pytest.raises(ConfigError, match="takes key:value"):
+        parse_overrides(["gamma"])
+    with pytest.raises(ConfigError, match="did you mean 'learning_rate'"):
+        parse_overrides(["low.learningrate:1"])
+
+
+def test_unknown_names() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'tbc-hrl'"):
+        config_file("tbc_hrl")
+    with pytest.raises(ConfigError, match="paper, tuned"):
+        load_config("tbc-hrl", "Pendulum", "best")
+
+
+def test_a_run_configuration_survives_yaml() -> None:
+    run = load_config("tbc-hrl", "UR5Reacher")
+    assert RunConfig.from_dict(yaml.safe_load(yaml.safe_dump(run.to_dict()))) == run
+    with pytest.raises(ConfigError, match=r"not a run's config\.yml"):
+        RunConfig.from_dict({"algo": "x"})
+
+
+@pytest.mark.parametrize("algo", sorted(COLUMN))
+def test_every_shipped_section_is_a_task(algo: str) -> None:
+    assert set(read_file(config_file(algo))) == {"default", *TASKS}
