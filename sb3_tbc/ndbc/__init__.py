@@ -1,0 +1,7 @@
+"""The NDBCNet: sparse wiring, conductance and dissipative cells, the network, and its NumPy form for acting."""
+
+from sb3_tbc.ndbc.frozen import FrozenNDBC
+from sb3_tbc.ndbc.network import NDBCNet
+from sb3_tbc.ndbc.wiring import NDBCWiring
+
+__all__ = ["FrozenNDBC", "NDBCNet", "NDBCWiring"]

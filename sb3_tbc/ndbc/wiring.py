@@ -1,0 +1,182 @@
+"""Who is wired to whom: four layers of neurons and their signed synapses. NumPy only."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SignMatrix = NDArray[np.int8]
+"""Synapses as a matrix ``[presynaptic, postsynaptic]``: +1 excitatory, -1 inhibitory, 0 none."""
+
+logger = logging.getLogger(__name__)
+
+LAYERS = ("inter", "command", "motor")
+
+
+class NDBCWiring:
+    """Sparse wiring sensory -> inter -> command -> motor, drawn once from a seed (paper, section 4.3 and table A1).
+
+    Inputs are the sensory neurons; they have no state. The neurons with a membrane potential are numbered inter,
+    command, motor. Targets are drawn evenly, so fan-ins within a layer differ as little as possible, and a neuron that no
+    draw has reached gets one synapse more: every neuron has at least one incoming synapse.
+
+    :param n_inputs: number of sensory neurons
+    :param inter: number of inter neurons
+    :param command: number of command neurons
+    :param motor: number of motor neurons
+    :param sensory_fanout: inter neurons each sensory neuron projects to
+    :param inter_fanout: command neurons each inter neuron projects to
+    :param recurrent_command_synapses: synapses among the command neurons, in all (no autapses)
+    :param motor_fanin: command neurons each motor neuron listens to
+    :param seed: seed of the draw, of targets as well as of polarities
+    :raises ValueError: if a size is not a positive integer or a fan is negative
+    """
+
+    def __init__(
+        self,
+        n_inputs: int,
+        inter: int,
+        command: int,
+        motor: int,
+        sensory_fanout: int,
+        inter_fanout: int,
+        recurrent_command_synapses: int,
+        motor_fanin: int,
+        seed: int = 0,
+    ) -> None:
+        self._set_sizes(n_inputs, inter, command, motor)
+        self.seed = seed
+        self.notes: tuple[str, ...] = ()
+        rng = np.random.default_rng(seed)
+        sensory_fanout = self._clip("sensory_fanout", sensory_fanout, inter, "inter neurons")
+        inter_fanout = self._clip("inter_fanout", inter_fanout, command, "command neurons")
+        motor_fanin = self._clip("motor_fanin", motor_fanin, command, "command neurons")
+        pairs = [(i, j) for i in range(command) for j in range(command) if i != j]
+        recurrent = self._clip(
+            "recurrent_command_synapses", recurrent_command_synapses, len(pairs), "ordered pairs of command neurons", 0
+        )
+        self.sensory = np.zeros((n_inputs, self.n_neurons), dtype=np.int8)
+        self.recurrent = np.zeros((self.n_neurons, self.n_neurons), dtype=np.int8)
+        inter_at, command_at, motor_at = (self.layer(name) for name in LAYERS)
+        self.sensory[:, inter_at] = _signed(rng, _fan_out(rng, n_inputs, inter, sensory_fanout))
+        self.recurrent[inter_at, command_at] = _signed(rng, _fan_out(rng, inter, command, inter_fanout))
+        among = np.zeros((command, command), dtype=bool)
+        for k in rng.permutation(len(pairs))[:recurrent]:
+            among[pairs[k]] = True
+        self.recurrent[command_at, command_at] = _signed(rng, among)
+        self.recurrent[command_at, motor_at] = _signed(rng, _fan_out(rng, motor, command, motor_fanin, rescue=False).T)
+
+    def _set_sizes(self, n_inputs: int, inter: int, command: int, motor: int) -> None:
+        for name, size in {"n_inputs": n_inputs, "inter": inter, "command": command, "motor": motor}.items():
+            if not isinstance(size, int | np.integer) or size < 1:
+                raise ValueError(f"{name} must be a positive whole number, got {size!r}")
+        self.n_inputs, self.inter, self.command, self.motor = int(n_inputs), int(inter), int(command), int(motor)
+
+    def _clip(self, name: str, fan: int, limit: int, of_what: str, least: int = 1) -> int:
+        if not isinstance(fan, int | np.integer) or fan < least:
+            raise ValueError(f"{name} must be a whole number of at least {least}, got {fan!r}")
+        if fan > limit:
+            note = f"{name}={fan} exceeds the {limit} {of_what}: clipped to {limit}"
+            logger.info(note)
+            self.notes = (*self.notes, note)
+        return int(min(fan, limit))
+
+    @property
+    def n_neurons(self) -> int:
+        """Neurons with a membrane potential: inter + command + motor."""
+        return self.inter + self.command + self.motor
+
+    @property
+    def n_synapses(self) -> int:
+        """Synapses from sensory neurons and among the others."""
+        return int(np.count_nonzero(self.sensory) + np.count_nonzero(self.recurrent))
+
+    def layer(self, name: str) -> slice:
+        """Where a layer's neurons lie in the state vector.
+
+        :param name: ``"inter"``, ``"command"`` or ``"motor"``
+        :raises ValueError: for any other name
+        """
+        if name not in LAYERS:
+            raise ValueError(f"layer must be one of {LAYERS}, got {name!r}; sensory neurons have no state")
+        sizes = (self.inter, self.command, self.motor)
+        start = sum(sizes[: LAYERS.index(name)])
+        return slice(start, start + sizes[LAYERS.index(name)])
+
+    def layer_of(self, neuron: int) -> str:
+        """Name of the layer a neuron of the state vector belongs to."""
+        return next(name for name in LAYERS if self.layer(name).start <= neuron < self.layer(name).stop)
+
+    def neuron_names(self) -> tuple[str, ...]:
+        """A name per neuron, ``("inter0", ..., "motor0", ...)``, in the order of the state vector."""
+        return tuple(f"{name}{i}" for name in LAYERS for i in range(getattr(self, name)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data: sizes, seed, notes, and every synapse as ``[presynaptic, postsynaptic, polarity]``."""
+        return {
+            **{name: getattr(self, name) for name in ("n_inputs", *LAYERS)},
+            "seed": self.seed,
+            "notes": list(self.notes),
+            "sensory_synapses": _to_list(self.sensory),
+            "synapses": _to_list(self.recurrent),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> NDBCWiring:
+        """The wiring that :meth:`to_dict` described; or, given the constructor's numbers, a freshly drawn one.
+
+        :raises ValueError: if a synapse names a neuron that does not exist or has a polarity other than +1 and -1
+        """
+        if "synapses" not in data:
+            return cls(**data)
+        wiring = cls.__new__(cls)
+        wiring._set_sizes(*(data[name] for name in ("n_inputs", *LAYERS)))
+        wiring.seed = int(data.get("seed", 0))
+        wiring.notes = tuple(data.get("notes", ()))
+        wiring.sensory = _from_list(data["sensory_synapses"], (wiring.n_inputs, wiring.n_neurons))
+        wiring.recurrent = _from_list(data["synapses"], (wiring.n_neurons, wiring.n_neurons))
+        return wiring
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, NDBCWiring) and self.to_dict() == other.to_dict()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        sizes = f"{self.n_inputs} sensory, {self.inter} inter, {self.command} command, {self.motor} motor"
+        return f"NDBCWiring({sizes} neurons, {self.n_synapses} synapses, seed={self.seed})"
+
+
+def _fan_out(rng: np.random.Generator, sources: int, targets: int, fan: int, rescue: bool = True) -> NDArray[np.bool_]:
+    """Each source picks ``fan`` targets, the least used first; ``rescue`` gives an unreached target one source."""
+    chosen = np.zeros((sources, targets), dtype=bool)
+    used = np.zeros(targets)
+    for source in rng.permutation(sources):
+        picked = np.lexsort((rng.random(targets), used))[:fan]
+        chosen[source, picked] = True
+        used[picked] += 1
+    if rescue:
+        for target in np.flatnonzero(used == 0):
+            chosen[rng.integers(sources), target] = True
+    return chosen
+
+
+def _signed(rng: np.random.Generator, mask: NDArray[np.bool_]) -> SignMatrix:
+    return np.where(mask, rng.choice(np.array([-1, 1], dtype=np.int8), size=mask.shape), 0).astype(np.int8)
+
+
+def _to_list(signs: SignMatrix) -> list[list[int]]:
+    return [[int(i), int(j), int(signs[i, j])] for i, j in np.argwhere(signs)]
+
+
+def _from_list(synapses: list[list[int]], shape: tuple[int, int]) -> SignMatrix:
+    signs = np.zeros(shape, dtype=np.int8)
+    for i, j, polarity in synapses:
+        if not (0 <= i < shape[0] and 0 <= j < shape[1]) or polarity not in (-1, 1):
+            raise ValueError(f"synapse {[i, j, polarity]} does not fit {shape[0]} x {shape[1]} neurons with polarity +-1")
+        signs[i, j] = polarity
+    return signs
