@@ -1,0 +1,47 @@
+"""Goal-conditioned tasks, registered with Gymnasium as ``sb3_tbc/<Task>-v0``."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+import gymnasium
+
+_CLASSES = {
+    "Pendulum": "pendulum",
+    "Drawbridge": "drawbridge",
+    "UR5Reacher": "ur5_reacher",
+}
+TASKS = tuple(_CLASSES)
+"""Names of the tasks; the id of each is ``sb3_tbc/<name>-v0``."""
+
+
+def make_task(task: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
+    """Build a task; the entry point behind ``gymnasium.make("sb3_tbc/<task>-v0", **kwargs)``.
+
+    :param task: one of :data:`TASKS`
+    :param kwargs: passed to the task's class
+    """
+    if task not in _CLASSES:
+        raise ValueError(f"task must be one of {TASKS}, got {task!r}")
+    task_class = getattr(import_module(f"{__name__}.{_CLASSES[task]}"), task)
+    env: gymnasium.Env[Any, Any] = task_class(**kwargs)
+    return env
+
+
+def register_tasks() -> None:
+    """Register every task with Gymnasium; calling it again changes nothing.
+
+    The wrappers of ``gymnasium.make`` are left out because the tasks check actions, order of calls and time limit
+    themselves.
+    """
+    for task in TASKS:
+        task_id = f"sb3_tbc/{task}-v0"
+        if task_id not in gymnasium.registry:
+            gymnasium.register(
+                id=task_id,
+                entry_point="sb3_tbc.tasks:make_task",
+                kwargs={"task": task},
+                order_enforce=False,
+                disable_env_checker=True,
+            )

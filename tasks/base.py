@@ -1,0 +1,275 @@
+"""Base class of the tasks: goals, rewards, time limit, start states and observation dictionaries in one place."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import logger, spaces
+from gymnasium.error import ResetNeeded
+from gymnasium_robotics.core import GoalEnv
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_tbc.spaces import SubgoalSpace
+
+Array = NDArray[np.float64]
+Observation = dict[str, Array]
+LAYOUTS = ("paper", "compact")
+
+
+class GoalTask(GoalEnv):  # type: ignore[misc]
+    """A goal-conditioned task with a sparse reward: 0 where the goal test holds after the step, -1 elsewhere.
+
+    Success terminates an episode, the time limit (kept by the task itself) truncates it, and ``info["is_success"]``
+    is there after every step. Actions outside the action space are clipped to it; NaN, infinite and wrongly shaped
+    ones are refused. ``reset(options={"goal": ..., "state": {...}})`` puts the task into an exact start.
+
+    Subclasses set the class attributes, build their physics, and implement the methods marked abstract. They take
+    keyword arguments only.
+
+    :param observation: ``"paper"`` (sizes of the paper's table 1) or ``"compact"`` (the public benchmark's vector)
+    :param legacy_quirks: reproduce the slips of the public implementation, listed in each task's docstring
+    :param render_mode: ``None``, ``"rgb_array"`` or ``"human"``
+    :raises ValueError: for an unknown layout or render mode
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
+    max_episode_steps: int
+    """Steps after which an episode is truncated."""
+    achieved_in_observation: bool = True
+    """Whether ``achieved_goal`` can be computed from ``observation``; if not, policies need to see it as well."""
+    action_bound: ClassVar[tuple[float, ...]] = (1.0,)
+    """Largest magnitude of each action entry; ranges are symmetric."""
+    goal_low: ClassVar[tuple[float, ...]]
+    goal_high: ClassVar[tuple[float, ...]]
+    goal_tolerance: ClassVar[tuple[float, ...]]
+    """Largest difference per goal coordinate that counts as success (inclusive), task units."""
+    observation_scale: Array
+    """Typical magnitude of each entry: ``observation / observation_scale`` lies about in [-1, 1]."""
+    goal_scale: Array
+    """The same for ``achieved_goal`` and ``desired_goal``."""
+    subgoals: SubgoalSpace
+
+    def __init__(
+        self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
+    ) -> None:
+        if observation not in LAYOUTS:
+            raise ValueError(f"observation must be one of {LAYOUTS}, got {observation!r}")
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
+        self.layout = observation
+        self.legacy_quirks = bool(legacy_quirks)
+        self.render_mode = render_mode
+        self.observation_scale, self.goal_scale, self.subgoals = self._describe()
+        bound = np.asarray(self.action_bound, dtype=np.float32)
+        self.action_space = spaces.Box(-bound, bound, dtype=np.float32)
+        goal_space = spaces.Box(np.array(self.goal_low), np.array(self.goal_high), dtype=np.float64)
+        size = len(self.observation_scale)
+        self.observation_space = spaces.Dict(
+            observation=spaces.Box(-np.inf, np.inf, (size,), dtype=np.float64),
+            achieved_goal=goal_space,
+            desired_goal=spaces.Box(goal_space.low, goal_space.high, dtype=np.float64),
+        )
+        self._action_shape = bound.shape
+        self._action_limit = [float(b) for b in bound]
+        self._elapsed = -1
+        self._goal: Array = np.zeros(len(self.goal_low))
+        self._goal_list: list[float] = self._goal.tolist()
+        self._tolerance = np.asarray(self.goal_tolerance, dtype=np.float64)
+        self._overlay: tuple[Array | None, float | None, str | None] = (None, None, None)
+        self._viewer: Any = None
+
+    # -- what a task must give -------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
+        """Observation scale (of the chosen layout), goal scale and subgoal space."""
+
+    @abstractmethod
+    def _sample_goal(self) -> Sequence[float]:
+        """Draw a desired goal from ``self.np_random``."""
+
+    @abstractmethod
+    def _restart(self, state: dict[str, Array]) -> None:
+        """Put the physics into the start state; ``state`` overrides what is otherwise drawn."""
+
+    @abstractmethod
+    def _advance(self, action: list[float]) -> None:
+        """Advance the physics by one control step with a legal action."""
+
+    @abstractmethod
+    def _observe(self, first: bool) -> tuple[Array, list[float]]:
+        """A fresh ``observation`` array and the achieved goal; ``first`` is true right after a reset."""
+
+    @abstractmethod
+    def task_state(self) -> dict[str, Array]:
+        """The physical state as a flat dictionary of fresh arrays, in physical units."""
+
+    @abstractmethod
+    def _draw(self) -> NDArray[np.uint8]:
+        """Draw the present state with its overlay, ``(height, width, 3)``."""
+
+    def _state_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Names and shapes that ``options["state"]`` may hold."""
+        return {}
+
+    # -- Gymnasium interface ---------------------------------------------------------------------------------------
+
+    def reset(
+        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Start an episode.
+
+        :param seed: seeds the task's own random generator
+        :param options: ``goal`` (desired goal) and ``state`` (dictionary of arrays); what is absent is drawn
+        :raises ValueError: for unknown keys, wrong shapes and values that are not finite
+        """
+        super().reset(seed=seed)
+        goal, state = self._read_options(options or {})
+        self._goal = np.array(self._sample_goal() if goal is None else goal, dtype=np.float64)
+        self._goal_list = self._goal.tolist()
+        self._overlay = (None, None, None)
+        self._elapsed = 0
+        self._restart(state)
+        observation, achieved = self._observe(True)
+        if self.render_mode == "human":
+            self.render()
+        return self._package(observation, achieved), {"is_success": self._holds(achieved, self._goal_list)}
+
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Advance by one control step.
+
+        :param action: in the units of ``action_space``; clipped to it
+        :raises ValueError: for an action of the wrong shape or type, or one that is not finite
+        :raises gymnasium.error.ResetNeeded: before the first reset
+        """
+        if self._elapsed < 0:
+            raise ResetNeeded(f"{type(self).__name__}: call reset() before step()")
+        self._advance(self._legal(action))
+        self._elapsed += 1
+        observation, achieved = self._observe(False)
+        success = self._holds(achieved, self._goal_list)
+        truncated = self._elapsed >= self.max_episode_steps and not success
+        if self.render_mode == "human":
+            self.render()
+        reward = 0.0 if success else -1.0
+        return self._package(observation, achieved), reward, success, truncated, {"is_success": success}
+
+    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+        """Sparse reward: 0 where the goal test holds, else -1.
+
+        :param achieved_goal: ``(goal_dim,)`` or ``(..., goal_dim)``
+        :param desired_goal: the same shape
+        :param info: ignored
+        :return: a float, or an array ``(...)`` for a batch
+        """
+        success = self._holds_batch(*_goal_pair(achieved_goal, desired_goal))
+        return np.where(success, 0.0, -1.0) if np.ndim(success) else (0.0 if success else -1.0)
+
+    def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+        """Whether the goal test holds: a bool, or an array for a batch. See :meth:`compute_reward`."""
+        success = self._holds_batch(*_goal_pair(achieved_goal, desired_goal))
+        return success if np.ndim(success) else bool(success)
+
+    def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+        """Whether the present step is cut by the time limit: at the limit and without success."""
+        terminated = self.compute_terminated(achieved_goal, desired_goal, info)
+        at_limit = self._elapsed >= self.max_episode_steps
+        return ~terminated & at_limit if np.ndim(terminated) else (at_limit and not terminated)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a picture (``"rgb_array"``) or show it in a window (``"human"``)."""
+        if self.render_mode is None:
+            logger.warn(f'{type(self).__name__}.render() does nothing: pass render_mode="rgb_array" or "human"')
+            return None
+        if self._elapsed < 0:
+            raise ResetNeeded(f"{type(self).__name__}: call reset() before render()")
+        picture = self._draw()
+        if self.render_mode == "rgb_array":
+            return picture
+        if self._viewer is None:
+            from .window import Window
+
+            self._viewer = Window(f"sb3_tbc {type(self).__name__}", self.metadata["render_fps"])
+        self._viewer.show(picture)
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._viewer is not None:
+            self._viewer.close()
+            self._viewer = None
+
+    def set_overlay(
+        self, subgoal: ArrayLike | None = None, time_left: float | None = None, text: str | None = None
+    ) -> None:
+        """Say what an agent pursues, to be drawn by :meth:`render` until the next reset.
+
+        :param subgoal: live subgoal in task units, ``(subgoal_dim,)``
+        :param time_left: remaining share of the time budget, 0 to 1
+        :param text: a short line
+        """
+        self._overlay = (None if subgoal is None else np.array(subgoal, dtype=np.float64), time_left, text)
+
+    # -- inner workings --------------------------------------------------------------------------------------------
+
+    def _holds(self, achieved: list[float], desired: list[float]) -> bool:
+        """Goal test of one pair in plain Python; agrees with :meth:`_holds_batch` to the bit."""
+        return all(abs(a - d) <= t for a, d, t in zip(achieved, desired, self.goal_tolerance, strict=True))
+
+    def _holds_batch(self, achieved: Array, desired: Array) -> Any:
+        return (np.abs(achieved - desired) <= self._tolerance).all(axis=-1)
+
+    def _package(self, observation: Array, achieved: list[float]) -> Observation:
+        return {"observation": observation, "achieved_goal": np.array(achieved), "desired_goal": self._goal.copy()}
+
+    def _legal(self, action: ArrayLike) -> list[float]:
+        """The action as plain floats inside the action space."""
+        array = np.asarray(action)
+        if array.shape != self._action_shape or array.dtype.kind not in "fiub":
+            raise ValueError(
+                f"action must be numbers of shape {self._action_shape}, got shape {array.shape} of type {array.dtype}"
+            )
+        values: list[float] = array.tolist()
+        for value, limit in zip(values, self._action_limit, strict=True):
+            if not -limit <= value <= limit:
+                return self._clipped(array)
+        return values
+
+    def _clipped(self, array: NDArray[Any]) -> list[float]:
+        if not np.all(np.isfinite(array)):
+            raise ValueError(f"action must be finite, got {array}. Has the policy diverged?")
+        clipped: list[float] = np.clip(array.astype(np.float64), self.action_space.low, self.action_space.high).tolist()
+        return clipped
+
+    def _read_options(self, options: Mapping[str, Any]) -> tuple[Array | None, dict[str, Array]]:
+        _check_keys("options", options, ("goal", "state"))
+        goal = options.get("goal")
+        if goal is not None:
+            goal = _finite_array("options['goal']", goal, (len(self.goal_low),))
+        shapes = self._state_shapes()
+        state = options.get("state") or {}
+        _check_keys("options['state']", state, tuple(shapes))
+        return goal, {k: _finite_array(f"options['state'][{k!r}]", v, shapes[k]) for k, v in state.items()}
+
+
+def _goal_pair(achieved: ArrayLike, desired: ArrayLike) -> tuple[Array, Array]:
+    achieved, desired = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
+    if achieved.shape != desired.shape:
+        raise ValueError(f"achieved and desired goals must have one shape, got {achieved.shape} and {desired.shape}")
+    return achieved, desired
+
+
+def _check_keys(what: str, given: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
+    unknown = sorted(set(given) - set(allowed))
+    if unknown:
+        raise ValueError(f"{what} has unknown keys {unknown}; allowed are {list(allowed)}")
+
+
+def _finite_array(what: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape or not np.all(np.isfinite(array)):
+        raise ValueError(f"{what} must be finite numbers of shape {shape}, got {value!r}")
+    return array

@@ -1,0 +1,61 @@
+"""What the MuJoCo tasks share: loading a model, stepping it, starting from a recorded state."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import Array, GoalTask
+
+
+class MujocoTask(GoalTask):
+    """A goal task whose physics is one MuJoCo model; actions are written to ``ctrl`` and held for a control step.
+
+    A reset draws ``qpos`` and ``qvel`` and then advances the simulator by one sub-step before the first observation,
+    as the public benchmark does. Ours starts from a cleared simulator; with ``legacy_quirks=True`` controls, solver
+    warm start and clock of the episode before stay, as there.
+    """
+
+    xml: ClassVar[str]
+    frame_skip: ClassVar[int]
+
+    def __init__(
+        self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
+    ) -> None:
+        self.model = mujoco.MjModel.from_xml_string(self.xml)
+        self.data = mujoco.MjData(self.model)
+        # Views into the simulator's memory stay valid for its lifetime; asking the bindings each step is slower.
+        self._qpos: Array = self.data.qpos
+        self._qvel: Array = self.data.qvel
+        self._ctrl: Array = self.data.ctrl
+        super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
+
+    @abstractmethod
+    def _sample_start(self) -> tuple[Array, Array]:
+        """Draw ``qpos`` and ``qvel`` from ``self.np_random``."""
+
+    def _state_shapes(self) -> dict[str, tuple[int, ...]]:
+        return {"qpos": (self.model.nq,), "qvel": (self.model.nv,)}
+
+    def _restart(self, state: dict[str, Array]) -> None:
+        if not self.legacy_quirks:
+            mujoco.mj_resetData(self.model, self.data)
+        qpos, qvel = self._sample_start()
+        self._qpos[:] = state.get("qpos", qpos)
+        self._qvel[:] = state.get("qvel", qvel)
+        mujoco.mj_step(self.model, self.data)
+
+    def _advance(self, action: list[float]) -> None:
+        self._ctrl[:] = action
+        mujoco.mj_step(self.model, self.data, self.frame_skip)
+
+    def task_state(self) -> dict[str, Array]:
+        """``qpos`` and ``qvel`` of the model."""
+        return {"qpos": self._qpos.copy(), "qvel": self._qvel.copy()}
+
+    def _draw(self) -> NDArray[np.uint8]:
+        raise NotImplementedError
