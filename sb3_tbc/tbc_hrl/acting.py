@@ -1,0 +1,132 @@
+"""Acting from the current weights in NumPy: at batch 1 a torch forward pass is mostly overhead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from sb3_tbc.tbc_hrl.policies import GaussianHead, MLPActor, NDBCActor
+
+FloatArray = NDArray[np.float32]
+
+
+def _relu(x: FloatArray) -> FloatArray:
+    return np.maximum(x, 0.0, out=x)
+
+
+def _silu(x: FloatArray) -> FloatArray:
+    return x * (0.5 + 0.5 * np.tanh(0.5 * x))
+
+
+def _elu(x: FloatArray) -> FloatArray:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+
+
+ACTIVATIONS: dict[type[nn.Module], Callable[[Any], Any]] = {
+    nn.ReLU: _relu,
+    nn.Tanh: np.tanh,
+    nn.SiLU: _silu,
+    nn.ELU: _elu,
+}
+
+
+class FrozenNet(Protocol):
+    """A network's outputs and next state for one control step, in NumPy."""
+
+    def __call__(self, observations: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]: ...
+
+    def refresh(self) -> None:
+        """Read the weights again after they changed."""
+
+
+class FrozenMLP:
+    """NumPy forward pass of an MLP actor; its arrays share memory with the parameters, so it is never stale.
+
+    :raises ValueError: for an activation function without a NumPy counterpart
+    """
+
+    def __init__(self, actor: MLPActor) -> None:
+        if actor.activation_fn not in ACTIVATIONS:
+            allowed = sorted(f.__name__ for f in ACTIVATIONS)
+            raise ValueError(f"activation_fn must be one of {allowed} to act in NumPy, got {actor.activation_fn}")
+        self._actor = actor
+        self._activation = ACTIVATIONS[actor.activation_fn]
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Point the arrays at the parameters again."""
+        blocks = self._actor.blocks()
+        arrays = []
+        for block in blocks:
+            start = block.parameters[0].detach()
+            arrays.append(start.as_strided(block.shape, _contiguous(block.shape)).numpy())
+        self._hidden = [(w.T, b) for w, b in zip(arrays[:-2:2], arrays[1:-2:2], strict=True)]
+        self._out_weight, self._out_bias = arrays[-2].T, arrays[-1]
+
+    def __call__(self, observations: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Outputs ``(n, 2 * action_dim)`` before the head's bounds, and the empty states."""
+        x = observations
+        activation = self._activation
+        for weight, bias in self._hidden:
+            x = np.dot(x, weight)
+            x += bias
+            x = activation(x)
+        return np.dot(x, self._out_weight) + self._out_bias, states
+
+
+def _contiguous(shape: tuple[int, ...]) -> tuple[int, ...]:
+    return (shape[1], 1) if len(shape) == 2 else (1,)
+
+
+def freeze(actor: MLPActor | NDBCActor) -> FrozenNet:
+    """NumPy forward pass of an actor whose parameters lie in flat storage."""
+    if isinstance(actor, NDBCActor):
+        from sb3_tbc.ndbc.frozen import FrozenNDBC
+
+        net: FrozenNet = FrozenNDBC(actor.net)
+        return net
+    return FrozenMLP(actor)
+
+
+class FrozenActor:
+    """Acts in NumPy from an actor's weights, read when :meth:`refresh` was last due.
+
+    :param actor: actor of a level whose parameters are in flat storage
+    """
+
+    def __init__(self, actor: MLPActor | NDBCActor) -> None:
+        self._net = freeze(actor)
+        head: GaussianHead = actor.head
+        self._mean_bound = head.mean_bound
+        self._low, self._high = head.log_std_bounds
+        self._dim = int(np.prod(actor.action_space.shape))
+        self.stale = False
+
+    def act(
+        self, observations: FloatArray, states: FloatArray, deterministic: bool, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """Unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``.
+
+        :param observations: ``(n, observation_dim)`` float32
+        :param states: ``(n, state_dim)`` float32
+        :param deterministic: the squashed mean instead of a sample
+        :param rng: source of the noise
+        """
+        if self.stale:
+            self._net.refresh()
+            self.stale = False
+        outputs, next_states = self._net(observations, states)
+        dim, bound = self._dim, self._mean_bound
+        mean = outputs[:, :dim]
+        if bound is not None:
+            mean = np.minimum(np.maximum(mean, -bound), bound)
+        if not deterministic:
+            std = np.exp(np.minimum(np.maximum(outputs[:, dim:], self._low), self._high))
+            std *= rng.standard_normal(mean.shape, dtype=np.float32)
+            std += mean
+            mean = std
+        return np.tanh(mean), next_states
