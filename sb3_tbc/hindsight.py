@@ -1,0 +1,317 @@
+"""Hindsight as pure functions on arrays: what both levels learn from a finished episode. NumPy only.
+
+Two relabellings (paper sections 4.2 and 4.5; HAC and HiTS before it): *hindsight action relabelling* (the paper's HGR)
+replaces an option that was not achieved by the one that was, and *hindsight goal relabelling* replaces the goal by one
+that was reached later. *Testing transitions* punish options that the low level could not achieve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.options import Episode, OptionRules
+from sb3_tbc.spaces import FloatArray, SubgoalSpace
+
+
+class GoalTest(NamedTuple):
+    """A task's reward and termination as batched functions of ``(achieved_goal, desired_goal)``."""
+
+    reward: Callable[[FloatArray, FloatArray], FloatArray]  # (n, goal_dim) x 2 -> (n,)
+    terminated: Callable[[FloatArray, FloatArray], NDArray[np.bool_]]  # (n, goal_dim) x 2 -> (n,)
+
+
+@dataclass(frozen=True)
+class HighLevelReward:
+    """The high level's reward and discount (paper section 4.1, with the scale of docs/decisions.md).
+
+    :param target: ``"smdp"``: ``R(dt) / dt_ref - decision_cost - duration_cost * dt / dt_max``, discounted by
+        ``gamma_step ** duration``; ``"decision"`` (HiTS): the last reward of the window minus the duration cost,
+        discounted by ``gamma`` once per decision
+    :param gamma: discount per decision
+    :param dt_ref: typical window, environment steps; ``gamma_step = gamma ** (1 / dt_ref)``
+    :param dt_max: longest window, environment steps
+    :param decision_cost: price of a decision (``"smdp"`` only: the HiTS reward has it built in)
+    :param duration_cost: price of the longest time budget
+    :raises ValueError: if ``target`` is unknown
+    """
+
+    target: str
+    gamma: float
+    dt_ref: float
+    dt_max: float
+    decision_cost: float
+    duration_cost: float
+
+    def __post_init__(self) -> None:
+        if self.target not in ("smdp", "decision"):
+            raise ValueError(f"target must be 'smdp' or 'decision', got {self.target!r}")
+
+    @property
+    def gamma_step(self) -> float:
+        """Discount per environment step."""
+        return float(self.gamma ** (1.0 / self.dt_ref)) if self.target == "smdp" else 1.0
+
+    def of(self, step_rewards: FloatArray, starts: NDArray[np.int64], durations: NDArray[np.int64]) -> FloatArray:
+        """Reward of windows that lie one behind the other in ``step_rewards``, before the duration cost, ``(n,)``."""
+        if self.target == "decision":
+            return np.asarray(step_rewards[starts + durations - 1], dtype=np.float64)
+        return discounted_sums(step_rewards, starts, durations, self.gamma_step) / self.dt_ref - self.decision_cost
+
+    def discounts(self, durations: NDArray[np.int64]) -> FloatArray:
+        """Factor of the next state's value for windows of these lengths, ``(n,)``."""
+        if self.target == "decision":
+            return np.full(len(durations), self.gamma)
+        return np.asarray(self.gamma_step**durations)
+
+
+def discounted_sums(
+    step_rewards: FloatArray, starts: NDArray[np.int64], durations: NDArray[np.int64], gamma: float
+) -> FloatArray:
+    """``sum_j gamma^j r_(start + j)`` of each window; windows must cover ``step_rewards`` in order (paper, R(dt))."""
+    within = np.arange(len(step_rewards)) - np.repeat(starts, durations)
+    return np.add.reduceat(step_rewards * gamma**within, starts)
+
+
+class LowLevelSteps(NamedTuple):
+    """The low level's transitions of one episode, one row per environment step."""
+
+    local: FloatArray
+    next_local: FloatArray
+    actions: FloatArray
+    states: FloatArray
+    next_states: FloatArray
+    subgoal: FloatArray  # what was asked for, task units
+    achieved: FloatArray  # subgoal-space point after the step
+    time_left: FloatArray  # (T,) steps of the budget left before the step
+    position: NDArray[np.int64]  # (T,) steps since the window began
+    length: NDArray[np.int64]  # (T,) steps the window took
+    rewards: FloatArray  # (T,)
+    dones: NDArray[np.bool_]  # (T,) the window is over: no bootstrap
+
+
+def low_level_steps(episode: Episode, subgoals: SubgoalSpace, rules: OptionRules) -> LowLevelSteps:
+    """Ordinary transitions of the low level: reward 1 where the window ends with its subgoal reached.
+
+    A window that the end of the episode cuts off is not over for the low level: its last step bootstraps.
+    """
+    lengths = np.array([option.duration for option in episode.options])
+    position = np.concatenate([np.arange(n) for n in lengths])
+    per_step = np.repeat(np.arange(len(lengths)), lengths)
+    budget = np.array([option.time_budget for option in episode.options])[per_step]
+    subgoal = np.stack([option.subgoal for option in episode.options])[per_step]
+    achieved = subgoals.achieved(_successors(episode))
+    reached = subgoals.reached(achieved, subgoal)
+    over = position + 1 >= budget
+    if rules.window_end == "reached":
+        over = over | (reached & (position + 1 >= rules.dt_min))
+    return LowLevelSteps(
+        local=episode.local[:-1],
+        next_local=episode.local[1:],
+        actions=episode.actions,
+        states=episode.states,
+        next_states=episode.next_states,
+        subgoal=subgoal,
+        achieved=achieved,
+        time_left=budget - position,
+        position=position,
+        length=lengths[per_step],
+        rewards=(over & reached).astype(np.float64),
+        dones=over,
+    )
+
+
+def _successors(episode: Episode) -> dict[str, FloatArray]:
+    return {
+        "observation": episode.observation[1:],
+        "achieved_goal": episode.achieved_goal[1:],
+        "desired_goal": episode.desired_goal[1:],
+    }
+
+
+def ordered_pairs(length: NDArray[np.int64], rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """A uniformly drawn pair ``0 <= first <= second < length`` for each window length."""
+    first = rng.integers(0, length)
+    second = rng.integers(0, length + 1)
+    # the half of the (length x length + 1) rectangle above the diagonal folds onto the half below it
+    fold = second > first
+    return np.where(fold, length - second, second), np.where(fold, length - 1 - first, first)
+
+
+class HighLevelSteps(NamedTuple):
+    """The high level's SMDP transitions of one episode, hindsight copies included, one row each."""
+
+    observations: FloatArray
+    actions: FloatArray  # unit coordinates
+    rewards: FloatArray
+    next_observations: FloatArray
+    dones: NDArray[np.bool_]
+    discounts: FloatArray
+    relabelled: NDArray[np.bool_]  # whether the action is a hindsight one
+    durations: NDArray[np.int64]
+
+
+class HindsightSettings(NamedTuple):
+    """How much hindsight the high level uses."""
+
+    n_goals: int  # goal copies per option
+    goal_strategy: str  # "future" or "episode"
+    testing_penalty: float  # reward of a testing transition, negative
+    keep_original: bool  # also store failed options as they were chosen (paper, algorithm 1 line 26)
+
+
+def relabel_actions(
+    episode: Episode, subgoals: SubgoalSpace, rules: OptionRules, rng: np.random.Generator
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """The action each option turned out to be, ``(n_options, subgoal_dim + 1)``, and which of them changed.
+
+    An achieved option keeps its action; another becomes (point reached, time it took), with the time drawn so that
+    the budget would have expired at just that step.
+    """
+    actions = np.stack([option.unit_action for option in episode.options])
+    failed = np.array([not option.reached for option in episode.options])
+    if failed.any():
+        ends = np.array([option.start + option.duration for option in episode.options])[failed]
+        durations = np.array([option.duration for option in episode.options])[failed]
+        reached = subgoals.achieved(_rows(episode, ends))
+        took = durations - rng.random(len(durations))
+        actions[failed, :-1] = np.clip(subgoals.scale(reached), -1.0, 1.0)
+        actions[failed, -1] = rules.unit_budget(np.maximum(took, rules.dt_min))
+    return actions, failed
+
+
+def _rows(episode: Episode, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
+    return {
+        "observation": episode.observation[rows],
+        "achieved_goal": episode.achieved_goal[rows],
+        "desired_goal": episode.desired_goal[rows],
+    }
+
+
+def goal_pairs(n_options: int, n_goals: int, strategy: str, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Rows ``(option, option whose outcome becomes its goal)`` for hindsight goal relabelling, ``(n, 2)``.
+
+    ``"future"`` draws from the later options of the episode, never an option's own outcome (as HiTS and HAC);
+    ``"episode"`` from all of them.
+
+    :raises ValueError: if the strategy is unknown
+    """
+    if strategy not in ("future", "episode"):
+        raise ValueError(f"goal_strategy must be 'future' or 'episode', got {strategy!r}")
+    options = np.arange(n_options)
+    if strategy == "episode":
+        pairs = np.repeat(options, min(n_goals, n_options))
+        return np.stack([pairs, rng.integers(0, n_options, len(pairs))], axis=1)
+    later = n_options - 1 - options
+    pairs = np.repeat(options, np.minimum(n_goals, later))
+    return np.stack([pairs, rng.integers(pairs + 1, n_options)], axis=1)
+
+
+def high_level_steps(
+    episode: Episode,
+    subgoals: SubgoalSpace,
+    rules: OptionRules,
+    reward: HighLevelReward,
+    settings: HindsightSettings,
+    goal_test: GoalTest,
+    high_view: Callable[[dict[str, FloatArray]], FloatArray],
+    rng: np.random.Generator,
+) -> HighLevelSteps:
+    """All SMDP transitions that the high level learns from in one episode, in this order:
+
+    testing transitions (failed tests, chosen action, penalty), hindsight-action transitions of all options, and
+    copies of these with hindsight goals.
+
+    :param high_view: maps goal observations to the high level's flat observation
+    """
+    n = len(episode.options)
+    starts = np.array([option.start for option in episode.options])
+    durations = np.array([option.duration for option in episode.options])
+    ends = starts + durations
+    chosen = np.stack([option.unit_action for option in episode.options])
+    actions, failed = relabel_actions(episode, subgoals, rules, rng)
+    testing = np.array([option.testing for option in episode.options])
+    before, after = _rows(episode, starts), _rows(episode, ends)
+    rewards = reward.of(episode.rewards, starts, durations)
+    dones = np.zeros(n, dtype=bool)
+    dones[-1] = episode.terminated
+
+    def steps(
+        rows: NDArray[np.int64],
+        actions: FloatArray,
+        rewards: FloatArray,
+        dones: NDArray[np.bool_],
+        durations: NDArray[np.int64],
+        relabelled: bool,
+        goals: FloatArray | None = None,
+    ) -> HighLevelSteps:
+        old, new = ({k: v[rows] for k, v in part.items()} for part in (before, after))
+        if goals is not None:
+            old["desired_goal"] = new["desired_goal"] = goals
+        return HighLevelSteps(
+            high_view(old), actions, rewards, high_view(new), dones, reward.discounts(durations),
+            failed[rows] & relabelled, durations,
+        )  # fmt: skip
+
+    def charged(rewards: FloatArray, actions: FloatArray) -> FloatArray:
+        return rewards - reward.duration_cost * rules.budget(actions[:, -1]) / rules.dt_max
+
+    parts = []
+    tests = np.flatnonzero(testing & failed)
+    penalty = np.full(len(tests), settings.testing_penalty)
+    parts.append(steps(tests, chosen[tests], penalty, dones[tests], durations[tests], False))
+    if settings.keep_original:
+        kept = np.flatnonzero(failed & ~testing)
+        parts.append(
+            steps(kept, chosen[kept], charged(rewards[kept], chosen[kept]), dones[kept], durations[kept], False)
+        )
+    every = np.arange(n)
+    parts.append(steps(every, actions, charged(rewards, actions), dones, durations, True))
+    pairs = goal_pairs(n, settings.n_goals, settings.goal_strategy, rng)
+    if len(pairs):
+        goals = episode.achieved_goal[ends[pairs[:, 1]]]
+        copies = relabel_goals(episode, starts[pairs[:, 0]], durations[pairs[:, 0]], goals, reward, goal_test)
+        rows = pairs[:, 0]
+        parts.append(
+            steps(rows, actions[rows], charged(copies.rewards, actions[rows]), copies.dones, copies.durations, True, goals)
+        )
+    return HighLevelSteps(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+class RelabelledGoals(NamedTuple):
+    """Reward, end and length of windows under other goals."""
+
+    rewards: FloatArray
+    dones: NDArray[np.bool_]
+    durations: NDArray[np.int64]
+
+
+def relabel_goals(
+    episode: Episode,
+    starts: NDArray[np.int64],
+    durations: NDArray[np.int64],
+    goals: FloatArray,
+    reward: HighLevelReward,
+    goal_test: GoalTest,
+) -> RelabelledGoals:
+    """Rewards of windows had their goals been ``goals`` (n, goal_dim).
+
+    With the SMDP target a window ends at the first step that meets the new goal, as the episode would have; HiTS's
+    target looks at the last step only.
+    """
+    offsets = np.concatenate([[0], np.cumsum(durations)[:-1]])
+    step = np.arange(int(durations.sum())) - np.repeat(offsets, durations) + np.repeat(starts, durations)
+    achieved, wanted = episode.achieved_goal[step + 1], np.repeat(goals, durations, axis=0)
+    step_rewards, met = goal_test.reward(achieved, wanted), goal_test.terminated(achieved, wanted)
+    last = offsets + durations - 1
+    if reward.target == "decision":
+        return RelabelledGoals(reward.of(step_rewards, offsets, durations), met[last], durations)
+    met_before = np.cumsum(met) - met
+    over = met_before - np.repeat(met_before[offsets], durations) > 0
+    rewards = reward.of(np.where(over, 0.0, step_rewards), offsets, durations)
+    dones = np.logical_or.reduceat(met, offsets)
+    return RelabelledGoals(rewards, dones, np.add.reduceat(~over, offsets).astype(np.int64))

@@ -1,0 +1,506 @@
+"""TBC-HRL: a high level that emits a subgoal and a time budget, a low level that executes it inside that window."""
+
+from __future__ import annotations
+
+import difflib
+import io
+import os
+import pathlib
+import time
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
+from sb3_tbc.hindsight import (
+    GoalTest,
+    HighLevelReward,
+    HindsightSettings,
+    high_level_steps,
+    low_level_steps,
+)
+from sb3_tbc.options import Episode, OptionRules
+from sb3_tbc.spaces import FloatArray, SubgoalSpace
+from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
+from sb3_tbc.tbc_hrl.level import SACLevel
+from sb3_tbc.tbc_hrl.policies import LevelPolicy
+from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
+from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, LevelLayout, Proposal, check_goal_space
+
+SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
+
+LEVEL_DEFAULTS: dict[str, Any] = {
+    "learning_rate": 1e-3,
+    "batch_size": 256,
+    "gamma": 0.98,
+    "tau": 0.01,
+    "ent_coef": "auto",
+    "target_entropy": "auto",
+    "buffer_size": 1_000_000,
+    "policy_kwargs": {"net_arch": [64, 64], "mean_bound": 3.0, "log_std_bounds": [-6.9, 1.8]},
+}
+"""What a level uses where the user says nothing; the head's bounds are HiTS's (sigma in [1e-3, 6])."""
+
+DEFAULT_WIRING = {
+    "inter": 8,
+    "command": 6,
+    "sensory_fanout": 4,
+    "inter_fanout": 5,
+    "recurrent_command_synapses": 3,
+    "motor_fanin": 5,
+}
+
+
+class Replay(NamedTuple):
+    """The replay buffers of both levels."""
+
+    high: OptionReplayBuffer
+    low: SubgoalReplayBuffer
+
+
+class TBCHRL(BaseAlgorithm):
+    """Timed and bionic circuit hierarchical reinforcement learning (Li, Shan, Mo 2025), two SAC levels.
+
+    :param policy: ``"MultiInputPolicy"``
+    :param env: a goal environment or its id; its ``subgoals`` attribute says what the high level may ask for
+    :param high: settings of the high level under SB3's names (``learning_rate, batch_size, gamma, tau, ent_coef,
+        target_entropy, buffer_size, policy_kwargs``); ``gamma`` is per decision
+    :param low: settings of the low level, likewise; ``policy_kwargs["ndbc"]`` holds the circuit's wiring, None for an
+        MLP actor; ``n_hindsight_goals`` may differ from the high level's
+    :param max_options: high-level decisions allowed per episode
+    :param window_end: ``"timed"`` or ``"reached"``, see :class:`~sb3_tbc.options.OptionRules`
+    :param dt_min: shortest time budget, environment steps
+    :param dt_max: longest, or -1 for the episode's length divided by ``max_options``
+    :param target: ``"smdp"`` (paper) or ``"decision"`` (HiTS), see :class:`~sb3_tbc.hindsight.HighLevelReward`
+    :param decision_cost: price of one decision
+    :param duration_cost: price of the longest time budget
+    :param testing_fraction: share of options that test their subgoal
+    :param deterministic_testing: whether the low level acts deterministically in a test (the public HiTS does not)
+    :param testing_penalty: reward of a failed test, None for ``-max_options``
+    :param keep_original: also learn from failed options as they were chosen (paper, algorithm 1)
+    :param random_fraction: share of uniformly random actions on each level while exploring
+    :param n_hindsight_goals: hindsight goals per transition
+    :param goal_strategy: where the high level's hindsight goals come from, ``"future"`` or ``"episode"``
+    :param gradient_ratio: updates of each level per environment step, done in bursts after episodes
+    :param learning_starts: environment steps before the first update
+    :param memory: when the membrane is reset: ``"window"``, ``"episode"`` or ``"none"`` (every step)
+    :param subgoals: the subgoal space, for environments that do not bring one
+    :param compile: compile the updates: ``"auto"`` (where a C++ compiler is found), True or False
+    :raises ValueError: on unknown settings or an environment without goals
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": TBCPolicy}
+    policy: TBCPolicy
+    default_window_end: ClassVar[str] = "timed"
+    default_target: ClassVar[str] = "smdp"
+    default_circuit: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        policy: str | type[TBCPolicy],
+        env: GymEnv | str | None,
+        *,
+        high: Mapping[str, Any] | None = None,
+        low: Mapping[str, Any] | None = None,
+        max_options: int = 20,
+        window_end: str | None = None,
+        dt_min: float = 0.0,
+        dt_max: float = -1.0,
+        target: str | None = None,
+        decision_cost: float = 1.0,
+        duration_cost: float = 1.0,
+        testing_fraction: float = 0.3,
+        deterministic_testing: bool = False,
+        testing_penalty: float | None = None,
+        keep_original: bool = False,
+        random_fraction: float = 0.05,
+        n_hindsight_goals: float = 3,
+        goal_strategy: str = "future",
+        gradient_ratio: float = 1.0,
+        learning_starts: int = 0,
+        memory: str = "window",
+        subgoals: SubgoalSpace | None = None,
+        compile: bool | str = "auto",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        device: th.device | str = "cpu",
+        seed: int | None = None,
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate=0.0,  # each level has its own
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+        )
+        self.high_settings = level_settings("high", high)
+        self.low_settings = level_settings("low", low, extra=("n_hindsight_goals",))
+        self.max_options, self.dt_min, self.dt_max = max_options, dt_min, dt_max
+        self.window_end = window_end or self.default_window_end
+        self.target = target or self.default_target
+        self.decision_cost, self.duration_cost = decision_cost, duration_cost
+        self.testing_fraction, self.deterministic_testing = testing_fraction, deterministic_testing
+        self.testing_penalty, self.keep_original = testing_penalty, keep_original
+        self.random_fraction, self.n_hindsight_goals = random_fraction, n_hindsight_goals
+        self.goal_strategy = goal_strategy
+        self.gradient_ratio, self.learning_starts = gradient_ratio, learning_starts
+        self.memory, self.compile = memory, compile
+        self.subgoals = subgoals
+        self._n_updates = 0
+        self._updated_at = 0
+        if _init_setup_model:
+            self._setup_model()
+
+    # ------------------------------------------------------------------ set-up
+
+    def _setup_model(self) -> None:
+        """Build both levels from the environment's spaces, or after loading from the saved ones."""
+        self._check_settings()
+        self.set_random_seed(self.seed)
+        space, actions = check_goal_space(self.observation_space), self.action_space
+        if not isinstance(actions, spaces.Box) or len(actions.shape) != 1:
+            raise ValueError(f"{type(self).__name__} needs a Box action space with one dimension, got {actions}")
+        if self.env is not None:
+            self._read_environment(self.env)
+        if self.subgoals is None:
+            raise ValueError("no subgoal space: pass subgoals=SubgoalSpace(...), or an environment that has .subgoals")
+        self.rules = OptionRules(self.dt_max, self.dt_min, self.max_options, self.window_end)
+        self.layout = LevelLayout(self.subgoals, self.achieved_in_observation)
+        self.high_reward = HighLevelReward(
+            self.target, self.high_settings["gamma"], self.rules.dt_ref, self.rules.dt_max,
+            self.decision_cost, self.duration_cost,
+        )  # fmt: skip
+        seeds = np.random.SeedSequence(self.seed).generate_state(6).tolist()
+        self.rng = np.random.default_rng(seeds[0])
+        self.high = self._make_level("high", self.high_settings, self.layout.high_space(space),
+                                     self.layout.high_action_space(), seeds[1])  # fmt: skip
+        unit_actions = spaces.Box(-1.0, 1.0, actions.shape, np.float32)
+        self.low = self._make_level("low", self.low_settings, self.layout.low_space(), unit_actions, seeds[2])
+        self._make_buffers(seeds[3], seeds[4])
+        self.policy = TBCPolicy(space, actions, self.high, self.low, self.layout, self.rules, self.memory, seeds[5])
+        self.diagnostics = EpisodeDiagnostics()
+        self.hierarchical_env: HierarchicalVecEnv | None = None
+
+    def _check_settings(self) -> None:
+        if self.memory not in ("window", "episode", "none"):
+            raise ValueError(f"memory must be 'window', 'episode' or 'none', got {self.memory!r}")
+        for name in ("testing_fraction", "random_fraction"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
+        if self.gradient_ratio < 0:
+            raise ValueError(f"gradient_ratio must not be negative, got {self.gradient_ratio}")
+
+    def _read_environment(self, env: VecEnv) -> None:
+        """What the task itself says: subgoals and episode length."""
+        if unwrap_vec_normalize(env) is not None:
+            raise ValueError(
+                "VecNormalize moves the subgoal space while the agent learns; use the task's fixed scales instead"
+            )
+        if self.subgoals is None:
+            self.subgoals = attribute_of(env, "subgoals")
+        achieved_in_observation = attribute_of(env, "achieved_in_observation")
+        self.achieved_in_observation = True if achieved_in_observation is None else bool(achieved_in_observation)
+        if self.dt_max == -1:
+            steps = attribute_of(env, "max_episode_steps") or getattr(
+                attribute_of(env, "spec"), "max_episode_steps", None
+            )
+            if steps is None:
+                raise ValueError("dt_max=-1 needs an environment with max_episode_steps; pass dt_max in steps")
+            self.dt_max = steps / self.max_options
+
+    def _make_level(
+        self, name: str, settings: dict[str, Any], observation: spaces.Box, action: spaces.Box, seed: int
+    ) -> SACLevel:
+        policy_kwargs = dict(settings["policy_kwargs"])
+        if name == "low":
+            policy_kwargs["ndbc"] = self._circuit(policy_kwargs, action.shape[0])
+        gamma = settings["gamma"]
+        level = SACLevel(
+            LevelPolicy, observation, action, None, settings["learning_rate"], gamma, settings["tau"],
+            settings["ent_coef"], settings["target_entropy"], policy_kwargs, seed=seed, device=self.device,
+            compile=self.compile,
+        )  # fmt: skip
+        level.log_prefix = f"{name}/"
+        return level
+
+    def _circuit(self, policy_kwargs: dict[str, Any], action_dim: int) -> dict[str, Any] | None:
+        """The NDBC settings with the task's fixed input scales; None for an MLP actor."""
+        default = {**DEFAULT_WIRING, "motor": action_dim} if self.default_circuit else None
+        circuit = policy_kwargs.get("ndbc", default)
+        if circuit is None:
+            return None
+        subgoals = self.layout.subgoals
+        scale = np.concatenate([subgoals.local_scale, np.maximum(np.abs(subgoals.low), np.abs(subgoals.high)), [1.0]])
+        return {"input_scale": scale.tolist(), **circuit}
+
+    def _make_buffers(self, high_seed: int, low_seed: int) -> None:
+        self.high.replay_buffer = OptionReplayBuffer(
+            self.high_settings["buffer_size"], self.high.observation_space, self.high.action_space,  # type: ignore[arg-type]
+            self.device, high_seed,
+        )  # fmt: skip
+        self.low.replay_buffer = SubgoalReplayBuffer(
+            self.low_settings["buffer_size"], self.low.observation_space, self.low.action_space,  # type: ignore[arg-type]
+            self.layout.subgoals, self.rules, self.low.policy.actor.state_dim, self.low_settings["gamma"],
+            self.low_settings.get("n_hindsight_goals", self.n_hindsight_goals), self.device, low_seed,
+        )  # fmt: skip
+
+    @property
+    def replay_buffer(self) -> Replay:
+        """The replay buffers of both levels."""
+        return Replay(self.high.replay_buffer, self.low.replay_buffer)  # type: ignore[arg-type]
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Train on another environment with the same spaces; the unfinished episode is dropped."""
+        super().set_env(env, force_reset)
+        self.hierarchical_env = None
+
+    # ------------------------------------------------------------------ learning
+
+    def learn(
+        self: SelfTBCHRL,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 10,
+        tb_log_name: str = "TBCHRL",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfTBCHRL:
+        """Collect whole episodes, then update both levels in a burst, until ``total_timesteps`` steps are done."""
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if self.env is None:
+            raise ValueError("learn needs an environment: call set_env first")
+        if reset_num_timesteps:
+            self._updated_at = 0
+        for level in (self.high, self.low):
+            level.set_logger(self.logger)
+        self.hierarchical_env = HierarchicalVecEnv(
+            self.env, self._propose, self.layout, self.rules, self.low.policy.actor.state_dim
+        )
+        self._low_observation = self.hierarchical_env.reset()
+        self._membrane = np.zeros((self.n_envs, self.low.policy.actor.state_dim), dtype=np.float32)
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < total_timesteps:
+            if not self.collect_rollouts(callback, total_timesteps):
+                break
+            self.train()
+            if log_interval and self._episode_num % log_interval == 0:
+                self.dump_logs()
+        callback.on_training_end()
+        return self
+
+    def collect_rollouts(self, callback: BaseCallback, total_timesteps: int) -> bool:
+        """Act until an episode is over (or the steps are used up); False if a callback asks to stop."""
+        env = self.hierarchical_env
+        assert env is not None
+        callback.on_rollout_start()
+        while not env.episodes and self.num_timesteps < total_timesteps:
+            unit = self._act()
+            self._low_observation, _, window_over, infos = env.step(self.policy._unscale(unit))
+            self._forget(window_over, infos)
+            self.num_timesteps += self.n_envs
+            self._update_info_buffer(list(infos), np.array(["episode_over" in info for info in infos]))
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+        self._store(env.episodes)
+        env.episodes = []
+        callback.on_rollout_end()
+        return True
+
+    def _propose(self, observations: FloatArray, where: NDArray[np.intp]) -> Proposal:
+        """The exploring high level: mostly SAC samples, sometimes uniform, some of them tests."""
+        n = len(where)
+        unit, _ = self.high.act(observations, np.zeros((n, 0), dtype=np.float32), False, self.rng)
+        uniform = self.rng.random(n) < self.random_fraction
+        if uniform.any():
+            unit[uniform] = self.rng.uniform(-1.0, 1.0, (int(uniform.sum()), unit.shape[1]))
+        return Proposal(unit.astype(np.float64), self.rng.random(n) < self.testing_fraction)
+
+    def _act(self) -> FloatArray:
+        """The exploring low level's unit actions for every environment."""
+        env = self.hierarchical_env
+        assert env is not None
+        before = self._membrane
+        unit, after = self.low.act(self._low_observation, before, False, self.rng)
+        uniform = self.rng.random(self.n_envs) < self.random_fraction
+        if uniform.any():
+            unit[uniform] = self.rng.uniform(-1.0, 1.0, (int(uniform.sum()), unit.shape[1]))
+        if self.deterministic_testing and env.clock.testing.any():
+            tested, _ = self.low.act(self._low_observation, before, True, self.rng)
+            unit = np.where(env.clock.testing[:, None], tested, unit)
+        env.remember(before, after)
+        self._membrane = after
+        return unit
+
+    def _forget(self, window_over: NDArray[np.bool_], infos: Any) -> None:
+        """Reset the membrane where its memory ends."""
+        if not self._membrane.shape[1]:
+            return
+        if self.memory == "none":
+            self._membrane = np.zeros_like(self._membrane)
+        elif window_over.any():
+            over = window_over if self.memory == "window" else np.array(["episode_over" in info for info in infos])
+            self._membrane = np.where(over[:, None], np.float32(0.0), self._membrane)
+
+    def _store(self, episodes: list[Episode]) -> None:
+        settings = HindsightSettings(
+            int(self.n_hindsight_goals),
+            self.goal_strategy,
+            -float(self.max_options) if self.testing_penalty is None else self.testing_penalty,
+            self.keep_original,
+        )
+        for episode in episodes:
+            self._episode_num += 1
+            self.replay_buffer.low.extend(low_level_steps(episode, self.layout.subgoals, self.rules))
+            options = high_level_steps(
+                episode, self.layout.subgoals, self.rules, self.high_reward, settings, self._goal_test(),
+                self.layout.high, self.rng,
+            )  # fmt: skip
+            self.replay_buffer.high.extend(options)
+            self.diagnostics.add(episode, options)
+
+    def _goal_test(self) -> GoalTest:
+        """The task's own reward and termination, asked of the first environment (as SB3's HER does)."""
+        env = self.env
+        assert env is not None
+
+        def ask(method: str, achieved: FloatArray, desired: FloatArray) -> NDArray[Any]:
+            answer = env.env_method(method, achieved, desired, {}, indices=[0])[0]
+            return np.broadcast_to(np.asarray(answer), (len(achieved),))
+
+        return GoalTest(
+            lambda a, d: ask("compute_reward", a, d).astype(np.float64),
+            lambda a, d: ask("compute_terminated", a, d).astype(bool),
+        )
+
+    def train(self) -> None:
+        """Update both levels as often as ``gradient_ratio`` and the steps since the last time say."""
+        steps = self.num_timesteps - self._updated_at
+        self._updated_at = self.num_timesteps
+        updates = int(self.gradient_ratio * steps)
+        if self.num_timesteps <= self.learning_starts or updates < 1:
+            return
+        for level, settings in ((self.high, self.high_settings), (self.low, self.low_settings)):
+            buffer = level.replay_buffer
+            if buffer is not None and buffer.size() >= settings["batch_size"]:
+                level._current_progress_remaining = self._current_progress_remaining
+                level.train(updates, settings["batch_size"])
+        self._n_updates += updates
+
+    def dump_logs(self) -> None:
+        """Write what was seen since the last time: SB3's keys, and per level what explains learning."""
+        elapsed = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
+        self.logger.record("time/episodes", self._episode_num, exclude="tensorboard")
+        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
+        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        if self.ep_info_buffer:
+            self.logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
+            self.logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
+        if self.ep_success_buffer:
+            self.logger.record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        for name, value in self.diagnostics.drain().items():
+            self.logger.record(name, value)
+        self.logger.record("train/n_updates", self._n_updates)
+        self.logger.dump(step=self.num_timesteps)
+
+    # ------------------------------------------------------------------ saving
+
+    def _excluded_save_params(self) -> list[str]:
+        return [
+            *super()._excluded_save_params(),
+            "high", "low", "hierarchical_env", "rng", "layout", "rules", "high_reward", "diagnostics",
+            "_low_observation", "_membrane",
+        ]  # fmt: skip
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = [], []
+        for name in ("high", "low"):
+            level_dicts, level_variables = getattr(self, name)._get_torch_save_params()
+            state_dicts += [f"{name}.{part}" for part in level_dicts]
+            variables += [f"{name}.{part}" for part in level_variables]
+        return state_dicts, variables
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Write both levels' replay buffers to one file of plain arrays, atomically."""
+        arrays = {
+            f"{name}.{key}": array
+            for name in ("high", "low")
+            for key, array in getattr(self.replay_buffer, name).get_state().items()
+        }
+        if isinstance(path, io.IOBase):
+            np.savez(path, **arrays)
+            return
+        target = pathlib.Path(path)  # type: ignore[arg-type]
+        partial = target.with_name(target.name + ".partial")
+        with open(partial, "wb") as file:
+            np.savez(file, **arrays)
+        os.replace(partial, target)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Read what :meth:`save_replay_buffer` wrote; only plain arrays are read, never pickled objects.
+
+        :param truncate_last_traj: for SB3's sake; unfinished episodes are never in the buffers
+        :raises ValueError: if the file was written for other spaces or sizes
+        """
+        with np.load(path, allow_pickle=False) as arrays:  # type: ignore[arg-type]
+            for name in ("high", "low"):
+                state = {
+                    key.removeprefix(f"{name}."): arrays[key] for key in arrays.files if key.startswith(f"{name}.")
+                }
+                getattr(self.replay_buffer, name).set_state(state)
+
+
+class HiTS(TBCHRL):
+    """Hierarchical RL with timed subgoals (Guertler, Buechler, Martius 2021) as a mode of the same code.
+
+    Windows run their full time, the reward is per decision, the low level is an MLP. Parameters as :class:`TBCHRL`.
+    """
+
+    default_window_end: ClassVar[str] = "timed"
+    default_target: ClassVar[str] = "decision"
+    default_circuit: ClassVar[bool] = False
+
+
+def attribute_of(env: VecEnv, name: str) -> Any:
+    """Attribute of the first task under its wrappers; None where there is none."""
+    try:
+        return env.get_attr(name, indices=[0])[0]
+    except AttributeError:
+        return None
+
+
+def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str, ...] = ()) -> dict[str, Any]:
+    """A level's settings with defaults filled in.
+
+    :raises ValueError: on an unknown name, naming the nearest valid one
+    """
+    given = dict(given or {})
+    allowed = [*LEVEL_DEFAULTS, *extra]
+    for key in given:
+        if key not in allowed:
+            near = difflib.get_close_matches(key, allowed, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"unknown setting {name}.{key}{hint} Allowed: {', '.join(sorted(allowed))}")
+    kwargs = {**LEVEL_DEFAULTS["policy_kwargs"], **given.get("policy_kwargs", {})}
+    if name == "high":
+        kwargs.setdefault("negative_critic", True)
+    return {**LEVEL_DEFAULTS, **given, "policy_kwargs": kwargs}

@@ -1,0 +1,140 @@
+"""Acting with both levels: the policy whose ``predict`` carries the live option and the membrane potentials."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_tbc.options import OptionRules
+from sb3_tbc.spaces import FloatArray
+from sb3_tbc.tbc_hrl.level import SACLevel
+from sb3_tbc.vec_env.hierarchical_vec_env import GOAL_KEYS, LevelLayout
+
+
+class TwoLevelState(NamedTuple):
+    """What ``predict`` hands on from step to step, one row per environment."""
+
+    subgoal: FloatArray  # (n, subgoal_dim), task units
+    time_budget: FloatArray  # (n,), steps
+    elapsed: NDArray[np.int64]  # (n,), steps since the option began
+    used: NDArray[np.int64]  # (n,), options begun in this episode
+    membrane: FloatArray  # (n, state_dim)
+
+
+class TBCPolicy(BasePolicy):
+    """Both levels as one policy.
+
+    :param observation_space: the task's goal observation
+    :param action_space: the task's action box
+    :param high: the high level
+    :param low: the low level
+    :param layout: how the levels' observations are put together
+    :param rules: what ends an option
+    :param memory: when the membrane is reset: at each new ``"window"``, ``"episode"``, or at every step (``"none"``)
+    :param seed: of the noise that ``predict(deterministic=False)`` draws
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        high: SACLevel,
+        low: SACLevel,
+        layout: LevelLayout,
+        rules: OptionRules,
+        memory: str,
+        seed: int | None = None,
+    ) -> None:
+        super().__init__(observation_space, action_space, squash_output=True)
+        self.high_policy, self.low_policy = high.policy, low.policy
+        self._levels = (high, low)
+        self.layout, self.rules, self.memory = layout, rules, memory
+        self.rng = np.random.default_rng(seed)
+
+    def initial_state(self, n_envs: int) -> TwoLevelState:
+        """State of ``n_envs`` environments that have not begun an option."""
+        return TwoLevelState(
+            np.zeros((n_envs, self.layout.subgoals.dim)),
+            np.zeros(n_envs),
+            np.zeros(n_envs, dtype=np.int64),
+            np.zeros(n_envs, dtype=np.int64),
+            np.zeros((n_envs, self._levels[1].policy.actor.state_dim), dtype=np.float32),
+        )
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """Primitive actions for one observation or a batch of them.
+
+        Pass the returned state back in with the next observation: it holds the live subgoal, its time budget and the
+        membrane potentials. ``state=None`` begins a new episode. The action budget is counted in ``state.used`` but
+        not enforced: a deployed agent goes on.
+
+        :param deterministic: use the means of both levels, and the averaged actors where they are kept
+        :return: actions in the environment's units, and the new state
+        :raises ValueError: if the observation is not that of a goal environment
+        """
+        batch, single = self._as_batch(observation)
+        n = len(batch["observation"])
+        now = self.initial_state(n) if state is None else TwoLevelState(*(np.array(part) for part in state))
+        starts = np.ones(n, bool) if state is None else np.zeros(n, bool)
+        if episode_start is not None:
+            starts |= np.asarray(episode_start, dtype=bool)
+        self._begin_options(now, batch, starts, deterministic)
+        remaining = self.rules.remaining(now.time_budget - now.elapsed)
+        seen = self.layout.low(self.layout.subgoals.local(batch), now.subgoal, remaining)
+        unit, membrane = self._levels[1].act(seen, now.membrane, deterministic, self.rng, average=deterministic)
+        actions = self._unscale(unit)
+        after = now._replace(elapsed=now.elapsed + 1, membrane=membrane)
+        return (actions[0] if single else actions), cast("tuple[NDArray[Any], ...]", after)
+
+    def _begin_options(
+        self, now: TwoLevelState, batch: dict[str, NDArray[Any]], starts: NDArray[np.bool_], deterministic: bool
+    ) -> None:
+        """Replace the options that are over, in place."""
+        now.used[starts] = 0
+        over = starts | (now.elapsed >= now.time_budget)
+        if self.rules.window_end == "reached":
+            reached = self.layout.subgoals.reached(self.layout.subgoals.achieved(batch), now.subgoal)
+            over |= reached & (now.elapsed >= self.rules.dt_min)
+        forget = {"window": over, "episode": starts, "none": np.ones_like(over)}[self.memory]
+        now.membrane[forget] = 0.0
+        where = np.flatnonzero(over)
+        if len(where):
+            seen = self.layout.high({key: batch[key][where] for key in GOAL_KEYS})
+            no_state = np.zeros((len(where), 0), dtype=np.float32)
+            unit, _ = self._levels[0].act(seen, no_state, deterministic, self.rng, average=deterministic)
+            now.subgoal[where] = self.layout.subgoals.unscale(unit[:, :-1])
+            now.time_budget[where] = self.rules.budget(unit[:, -1])
+            now.elapsed[where] = 0
+            now.used[where] += 1
+
+    def _as_batch(self, observation: Any) -> tuple[dict[str, NDArray[Any]], bool]:
+        if not isinstance(observation, dict) or any(key not in observation for key in GOAL_KEYS):
+            found = sorted(observation) if isinstance(observation, dict) else type(observation).__name__
+            raise ValueError(f"predict needs a goal observation with the keys {sorted(GOAL_KEYS)}, got {found}")
+        batch = {key: np.asarray(observation[key]) for key in GOAL_KEYS}
+        single = batch["observation"].ndim == 1
+        return ({key: part[None] for key, part in batch.items()} if single else batch), single
+
+    def _unscale(self, unit: FloatArray) -> FloatArray:
+        space = cast(spaces.Box, self.action_space)
+        return (space.low + 0.5 * (unit + 1.0) * (space.high - space.low)).astype(space.dtype)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        """SB3's tensor form of a single, memoryless step."""
+        batch = {key: np.asarray(part) for key, part in observation.items()}
+        return th.as_tensor(self.predict(batch, deterministic=deterministic)[0])
+
+    def forward(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        """Same as ``_predict``."""
+        return self._predict(observation, deterministic)

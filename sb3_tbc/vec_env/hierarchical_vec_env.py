@@ -1,0 +1,271 @@
+"""The two levels meet here: a vector of goal environments becomes the low level's problem."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_tbc.errors import HierarchyError
+from sb3_tbc.options import Episode, OptionClock, OptionRules
+from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
+from sb3_tbc.vec_env.recorder import EpisodeRecorder
+
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+class Proposal(NamedTuple):
+    """What the high level answers when asked for options: one row per environment that needs one."""
+
+    unit_actions: FloatArray  # (n, subgoal_dim + 1) in [-1, 1]: subgoal, then time budget
+    testing: NDArray[np.bool_]  # (n,), whether the option is a subgoal test
+
+
+HighLevel = Callable[[FloatArray, NDArray[np.intp]], Proposal]
+"""Maps high-level observations ``(n, high_dim)`` of the environments ``(n,)`` to their next options."""
+
+
+def check_goal_space(space: spaces.Space[Any]) -> spaces.Dict:
+    """Return the space if it is that of a goal environment.
+
+    :raises ValueError: naming what is missing
+    """
+    if not isinstance(space, spaces.Dict) or any(key not in space.spaces for key in GOAL_KEYS):
+        found = sorted(space.spaces) if isinstance(space, spaces.Dict) else type(space).__name__
+        raise ValueError(
+            f"a hierarchical agent needs a goal environment: a Dict observation with the keys {sorted(GOAL_KEYS)}, "
+            f"got {found}. Derive it from gymnasium_robotics.core.GoalEnv."
+        )
+    for key in GOAL_KEYS:
+        part = space.spaces[key]
+        if not isinstance(part, spaces.Box) or len(part.shape) != 1:
+            raise ValueError(f"observation[{key!r}] must be a Box with one dimension, got {part}")
+    return space
+
+
+class LevelLayout(NamedTuple):
+    """How the flat observation vectors of both levels are put together."""
+
+    subgoals: SubgoalSpace
+    achieved_in_observation: bool
+
+    def high(self, observation: GoalObservation) -> FloatArray:
+        """What the high level sees: desired goal, observation and, where the task needs it, achieved goal."""
+        parts = [observation["desired_goal"], observation["observation"]]
+        if not self.achieved_in_observation:
+            parts.append(observation["achieved_goal"])
+        return np.concatenate(parts, axis=-1).astype(np.float32)
+
+    def low(self, local: FloatArray, subgoal: FloatArray, remaining: FloatArray) -> FloatArray:
+        """What the low level sees: local state, subgoal (task units), remaining time in [0, 1]."""
+        return np.concatenate([local, subgoal, np.asarray(remaining)[..., None]], axis=-1).astype(np.float32)
+
+    def high_space(self, space: spaces.Dict) -> spaces.Box:
+        """Observation space of the high level."""
+        keys = ["desired_goal", "observation"] + ([] if self.achieved_in_observation else ["achieved_goal"])
+        size = sum(space.spaces[key].shape[0] for key in keys)  # type: ignore[index]
+        return spaces.Box(-np.inf, np.inf, (size,), np.float32)
+
+    def low_space(self) -> spaces.Box:
+        """Observation space of the low level."""
+        return spaces.Box(-np.inf, np.inf, (self.subgoals.local_dim + self.subgoals.dim + 1,), np.float32)
+
+    def high_action_space(self) -> spaces.Box:
+        """Action space of the high level in unit coordinates: subgoal, then time budget."""
+        return spaces.Box(-1.0, 1.0, (self.subgoals.dim + 1,), np.float32)
+
+
+class HierarchicalVecEnv(VecEnvWrapper):
+    """Runs timed windows over a vector of goal environments and shows the low level's problem.
+
+    An observation is ``(local state, subgoal, remaining time)``, a reward is 1 when a window ends with its subgoal
+    reached and else 0, and a done flag is the end of a *window*. When windows end, the high level is asked for the
+    next options of just those environments; the others do not wait. Finished episodes wait in :attr:`episodes`.
+
+    :param venv: goal environments; automatic resets as in SB3
+    :param high_level: proposes options; may be set later through the attribute of the same name
+    :param layout: how the levels' observations are put together
+    :param rules: what ends an option
+    :param state_dim: width of the low level's memory to record with each step
+    :param record: keep whole episodes for learning; without it :attr:`episodes` stays empty
+    :raises ValueError: if the environments are not goal environments or their actions not a Box
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        high_level: HighLevel | None,
+        layout: LevelLayout,
+        rules: OptionRules,
+        state_dim: int = 0,
+    ) -> None:
+        space = check_goal_space(venv.observation_space)
+        super().__init__(venv, observation_space=layout.low_space(), action_space=venv.action_space)
+        self.high_level = high_level
+        self.layout = layout
+        self.rules = rules
+        self.clock = OptionClock(venv.num_envs, layout.subgoals.dim, rules)
+        self.episodes: list[Episode] = []
+        self._everywhere = np.arange(venv.num_envs)
+        self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
+        self._memory = (self._no_memory, self._no_memory)
+        self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
+        self._started = False
+
+    def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
+        sizes = {key: space.spaces[key].shape[0] for key in GOAL_KEYS}  # type: ignore[index]
+        actions = self.action_space.shape
+        if not isinstance(self.action_space, spaces.Box) or actions is None or len(actions) != 1:
+            raise ValueError(f"a hierarchical agent needs a Box action space with one dimension, got {self.action_space}")
+        return {
+            **sizes,
+            "local": self.layout.subgoals.local_dim,
+            "actions": actions[0],
+            "states": state_dim,
+            "next_states": state_dim,
+        }
+
+    def reset(self) -> FloatArray:  # type: ignore[override]
+        """Reset every environment and ask for its first option."""
+        observation: GoalObservation = self.venv.reset()  # type: ignore[assignment]
+        local = self.layout.subgoals.local(observation)
+        self._begin_episodes(self._everywhere, observation, local)
+        self._begin_options(self._everywhere, observation)
+        self._started = True
+        return self._low_observation(local)
+
+    def remember(self, states: FloatArray, next_states: FloatArray) -> None:
+        """Membrane potentials before and after the coming step, ``(n_envs, state_dim)``, to be recorded with it."""
+        self._memory = (states, next_states)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Step with actions in the environment's units.
+
+        :raises HierarchyError: before the first reset
+        """
+        if not self._started:
+            raise HierarchyError("HierarchicalVecEnv.step was called before reset")
+        self._recorder.before_step(self._unit_actions(actions), *self._memory)
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Advance every environment by one step; close and replace the options that end with it."""
+        observation, rewards, dones, infos = self.venv.step_wait()
+        seen = self._before_reset(observation, dones, infos)  # type: ignore[arg-type]
+        local = self.layout.subgoals.local(seen)
+        self._recorder.after_step(rewards, seen, local)
+        self.clock.tick()
+        reached, ended = self._window_ends(seen, dones)
+        low_rewards = np.zeros(self.num_envs, dtype=np.float32)
+        if ended.any():
+            where = np.flatnonzero(ended)
+            low_rewards[where] = self._close_options(where, seen, reached, dones, infos)
+            local = self._next_options(where, observation, local, dones, infos)  # type: ignore[arg-type]
+        return self._low_observation(local), low_rewards, ended, infos
+
+    def _unit_actions(self, actions: FloatArray) -> FloatArray:
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        return np.asarray(2.0 * (actions - low) / (high - low) - 1.0)
+
+    def _before_reset(
+        self, observation: GoalObservation, dones: NDArray[np.bool_], infos: list[dict[str, Any]]
+    ) -> GoalObservation:
+        """What the step led to: SB3 hides the last observation of an episode in ``info``."""
+        if not dones.any():
+            return observation
+        seen = {key: np.array(observation[key]) for key in GOAL_KEYS}
+        for index in np.flatnonzero(dones):
+            for key in GOAL_KEYS:
+                seen[key][index] = infos[index]["terminal_observation"][key]
+        return seen
+
+    def _window_ends(
+        self, seen: GoalObservation, dones: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.bool_] | None, NDArray[np.bool_]]:
+        """Which subgoals are reached (``None``: not looked at, no window can end by it) and which windows end."""
+        expired = self.clock.expired
+        if self.rules.window_end == "timed":
+            return None, expired | dones
+        reached = self._reached(seen, self._everywhere)
+        early = reached & (self.clock.elapsed >= self.rules.dt_min)
+        return reached, expired | early | dones
+
+    def _reached(self, seen: GoalObservation, where: NDArray[np.intp]) -> NDArray[np.bool_]:
+        subgoals = self.layout.subgoals
+        achieved = subgoals.achieved({key: seen[key][where] for key in GOAL_KEYS})
+        return subgoals.reached(achieved, self.clock.subgoal[where])
+
+    def _close_options(
+        self,
+        where: NDArray[np.intp],
+        seen: GoalObservation,
+        reached: NDArray[np.bool_] | None,
+        dones: NDArray[np.bool_],
+        infos: list[dict[str, Any]],
+    ) -> FloatArray:
+        """Record the options that end; the low level's reward of each."""
+        reached_here = self._reached(seen, where) if reached is None else reached[where]
+        rewards = np.zeros(len(where), dtype=np.float32)
+        for row, index in enumerate(where):
+            step = int(self._recorder.steps[index])
+            option = self.clock.close(index, step, bool(reached_here[row]), bool(dones[index]))
+            self._recorder.options[index].append(option)
+            infos[index]["option"] = option.as_info()
+            rewards[row] = float(option.reached)
+        return rewards
+
+    def _next_options(
+        self,
+        where: NDArray[np.intp],
+        observation: dict[str, FloatArray],
+        local: FloatArray,
+        dones: NDArray[np.bool_],
+        infos: list[dict[str, Any]],
+    ) -> FloatArray:
+        """Finish episodes, begin options; the local view after automatic and enforced resets."""
+        over = where[dones[where] | (self.clock.used[where] >= self.rules.max_options)]
+        for index in over:
+            self._finish_episode(index, observation, bool(dones[index]), infos[index])
+        if len(over):
+            local = self.layout.subgoals.local(observation)
+            self._begin_episodes(over, {key: observation[key][over] for key in GOAL_KEYS}, local[over])
+        self._begin_options(where, observation)
+        return local
+
+    def _finish_episode(
+        self, index: int, observation: dict[str, FloatArray], done: bool, info: dict[str, Any]
+    ) -> None:
+        truncated = bool(info.get("TimeLimit.truncated", False)) or not done
+        success = bool(info.get("is_success", False)) and done
+        episode = self._recorder.finish(index, terminated=not truncated, success=success)
+        self.episodes.append(episode)
+        info["episode_over"] = True
+        info["budget_exhausted"] = not done
+        if not done:  # the environment itself would go on: end the episode for it
+            info["terminal_observation"] = {key: np.array(observation[key][index]) for key in GOAL_KEYS}
+            info["TimeLimit.truncated"] = True
+            info["episode"] = {"r": float(episode.rewards.sum()), "l": episode.length, "t": 0.0}
+            fresh, _ = self.venv.env_method("reset", indices=[int(index)])[0]
+            for key in GOAL_KEYS:
+                observation[key][index] = fresh[key]
+
+    def _begin_episodes(self, where: NDArray[np.intp], observation: GoalObservation, local: FloatArray) -> None:
+        self.clock.begin_episode(where)
+        self._recorder.begin(where, observation, local)
+
+    def _begin_options(self, where: NDArray[np.intp], observation: GoalObservation) -> None:
+        if self.high_level is None:
+            raise HierarchyError("HierarchicalVecEnv needs a high level that proposes options: set .high_level")
+        seen = {key: observation[key][where] for key in GOAL_KEYS}
+        proposal = self.high_level(self.layout.high(seen), where)
+        subgoal = self.layout.subgoals.unscale(proposal.unit_actions[:, :-1])
+        self.clock.begin(where, proposal.unit_actions, subgoal, proposal.testing)
+
+    def _low_observation(self, local: FloatArray) -> FloatArray:
+        remaining = self.rules.remaining(self.clock.time_left)
+        return self.layout.low(local, self.clock.subgoal, remaining)

@@ -1,0 +1,80 @@
+"""Grows one array per quantity and environment while an episode runs, so that learning gets whole episodes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.options import Episode, Option
+from sb3_tbc.spaces import FloatArray, GoalObservation
+
+
+class EpisodeRecorder:
+    """Records the running episode of each environment of a vector.
+
+    :param n_envs: number of environments
+    :param sizes: width of each recorded quantity: the fields of :class:`~sb3_tbc.options.Episode` by name
+    :param capacity: steps to make room for at first; grows by doubling
+    """
+
+    _exact = ("achieved_goal", "desired_goal")
+
+    def __init__(self, n_envs: int, sizes: dict[str, int], capacity: int = 1024) -> None:
+        self.n_envs = n_envs
+        self.steps = np.zeros(n_envs, dtype=np.int64)
+        self.options: list[list[Option]] = [[] for _ in range(n_envs)]
+        self._all = np.arange(n_envs)
+        self._data = {
+            name: np.zeros((n_envs, capacity + 1, size), dtype=np.float64 if name in self._exact else np.float32)
+            for name, size in sizes.items()
+        }
+        self._rewards = np.zeros((n_envs, capacity + 1))
+
+    def begin(self, indices: NDArray[np.intp], observation: GoalObservation, local: FloatArray) -> None:
+        """Start new episodes; the arrays have one row per entry of ``indices``."""
+        self.steps[indices] = 0
+        for index in indices:
+            self.options[index] = []
+        self._write(indices, self.steps[indices], observation, local)
+
+    def before_step(self, actions: FloatArray, states: FloatArray, next_states: FloatArray) -> None:
+        """What the low level is about to do in every environment, and its memory before and after."""
+        if int(self.steps.max()) + 1 >= self._rewards.shape[1]:
+            self._grow()
+        at = (self._all, self.steps)
+        self._data["actions"][at] = actions
+        if states.shape[1]:
+            self._data["states"][at] = states
+            self._data["next_states"][at] = next_states
+
+    def after_step(self, rewards: FloatArray, observation: GoalObservation, local: FloatArray) -> None:
+        """What the step led to in every environment, before any automatic reset."""
+        self._rewards[self._all, self.steps] = rewards
+        self.steps += 1
+        self._write(self._all, self.steps, observation, local)
+
+    def finish(self, index: int, terminated: bool, success: bool) -> Episode:
+        """The episode that has just ended in environment ``index``, as arrays of its own."""
+        length = int(self.steps[index])
+        seen = {n: self._data[n][index, : length + 1].copy() for n in ("observation", *self._exact, "local")}
+        done = {n: self._data[n][index, :length].copy() for n in ("actions", "states", "next_states")}
+        return Episode(
+            **seen,
+            **done,
+            rewards=self._rewards[index, :length].copy(),
+            options=tuple(self.options[index]),
+            terminated=terminated,
+            success=success,
+        )
+
+    def _write(
+        self, rows: NDArray[np.intp], steps: NDArray[np.int64], observation: GoalObservation, local: FloatArray
+    ) -> None:
+        for name in ("observation", *self._exact):
+            self._data[name][rows, steps] = observation[name]
+        self._data["local"][rows, steps] = local
+
+    def _grow(self) -> None:
+        for name, array in self._data.items():
+            self._data[name] = np.concatenate([array, np.zeros_like(array)], axis=1)
+        self._rewards = np.concatenate([self._rewards, np.zeros_like(self._rewards)], axis=1)
