@@ -37,7 +37,8 @@ ACTIVATIONS: dict[type[nn.Module], Callable[[Any], Any]] = {
 class FrozenNet(Protocol):
     """A network's outputs and next state for one control step, in NumPy."""
 
-    def __call__(self, observations: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]: ...
+    def __call__(self, observations: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Outputs ``(n, 2 * action_dim)`` and next states ``(n, state_dim)``."""
 
     def refresh(self) -> None:
         """Read the weights again after they changed."""

@@ -1,7 +1,7 @@
 """One SAC update as one function over flat storage, run eagerly or as one compiled graph.
 
-The numbers are those of SB3's ``SAC.train`` (Haarnoja et al. 2018, arXiv 1812.05905), in its order: temperature, critics,
-actor (through the updated critics), targets. What differs is the storage. All parameters of a network lie in one
+The numbers are those of SB3's ``SAC.train`` (Haarnoja et al. 2018, arXiv 1812.05905), in its order: temperature,
+critics, actor (through the updated critics), targets. What differs is the storage: a network's parameters lie in one
 vector, whose slices the policy's modules share, so that
 
 * all critics' layers are one batched product, Adam and Polyak averaging a few operations over one vector;
@@ -226,7 +226,7 @@ class SACUpdate:
         return self._steps[batch_size]
 
     def _step(self, stats: th.Tensor, ent: th.Tensor, *tensors: th.Tensor) -> None:
-        """One update. All arguments are tensors; those of :meth:`_state`, ``stats`` and ``ent`` are changed in place."""
+        """One update; the tensors of :meth:`_state`, ``stats`` and ``ent`` are changed in place."""
         actor, critic, target, average = tensors[:4]
         n_moments = 2 * len(self.optimizers())
         moments, constants = tensors[4 : 4 + n_moments], tensors[4 + n_moments : -10]
