@@ -20,6 +20,8 @@ class ConductanceArrays(NamedTuple):
     recurrent: th.Tensor  # (N, 2 N): columns w E | w of the synapses among neurons
     rest: th.Tensor  # (2 N,): g_l V_leak | g_l + g_in
     capacitance: th.Tensor  # (N,)
+    gain: th.Tensor  # (N,), steepness of the presynaptic logistic
+    sensory_gain: th.Tensor  # (I,)
 
 
 def inverse_softplus(value: th.Tensor) -> th.Tensor:
@@ -53,9 +55,9 @@ class ConductanceCell(nn.Module):
         self.raw_capacitance = nn.Parameter(inverse_softplus(uniform(n, *INITIAL["capacitance"])))
         self.raw_leak = nn.Parameter(inverse_softplus(uniform(n, *INITIAL["leak"])))
         self.leak_potential = nn.Parameter(uniform(n, -0.1, 0.1))
-        self.gain = nn.Parameter(uniform(n, *INITIAL["gain"]))
+        self.raw_gain = nn.Parameter(inverse_softplus(uniform(n, *INITIAL["gain"])))
         self.threshold = nn.Parameter(uniform(n, -0.5, 0.5))
-        self.sensory_gain = nn.Parameter(uniform(self.n_inputs, *INITIAL["gain"]))
+        self.raw_sensory_gain = nn.Parameter(inverse_softplus(uniform(self.n_inputs, *INITIAL["gain"])))
         self.sensory_threshold = nn.Parameter(uniform(self.n_inputs, -0.5, 0.5))
         self.raw_input_conductance = nn.Parameter(inverse_softplus(uniform(m, *INITIAL["input"])))
         fan_in = max(1.0, n_current / m)
@@ -81,20 +83,23 @@ class ConductanceCell(nn.Module):
         self.register_buffer("matrix_index", th.as_tensor(np.concatenate([reversal_at, reversal_at + n, current_at])))
         self.register_buffer("current_index", th.as_tensor(pre_c * m + post_c))
 
+    def positive(self) -> tuple[th.Tensor, ...]:
+        """The positive quantities: conductance, |E|, g_in, C, g_l, gain, sensory gain, each one per synapse or neuron."""
+        raw = [self.raw_conductance, self.raw_reversal, self.raw_input_conductance, self.raw_capacitance, self.raw_leak]
+        raw += [self.raw_gain, self.raw_sensory_gain]
+        return functional.softplus(th.cat(raw)).split([len(r) for r in raw])
+
     def arrays(self) -> ConductanceArrays:
         """Masked conductances from the current free parameters; differentiable."""
         n, m, inputs = self.n_neurons, self.n_inter, self.n_inputs
-        positive = functional.softplus(
-            th.cat([self.raw_conductance, self.raw_input_conductance, self.raw_reversal, self.raw_capacitance, self.raw_leak])
-        )
-        n_syn = len(self.polarity)
-        conductance, input_conductance, reversal, capacitance, leak = positive.split([n_syn, m, n_syn, n, n])
+        positive = self.positive()
+        conductance, reversal, input_conductance, capacitance, leak, gain, sensory_gain = positive
         values = th.cat([conductance * reversal * self.polarity, conductance, input_conductance])
         flat = values.new_zeros((inputs + m + n) * 2 * n).scatter(0, self.matrix_index, values)
         from_inputs, recurrent = flat.view(inputs + m + n, 2 * n).split([inputs + m, n])
         current = values.new_zeros(inputs * m).scatter(0, self.current_index, self.current_weight).view(inputs, m)
         rest = th.cat([leak * self.leak_potential, leak + functional.pad(input_conductance, (0, n - m))])
-        return ConductanceArrays(current, from_inputs, recurrent, rest, capacitance)
+        return ConductanceArrays(current, from_inputs, recurrent, rest, capacitance, gain, sensory_gain)
 
     def drive(self, inputs: th.Tensor, arrays: ConductanceArrays) -> th.Tensor:
         """What the inputs contribute to numerator and denominator of the step, constant over its sub-steps.
@@ -102,7 +107,7 @@ class ConductanceCell(nn.Module):
         :param inputs: scaled inputs, ``(..., n_inputs)``
         :return: ``(..., 2 n_neurons)``: sum of conductance x potential | sum of conductances
         """
-        sensed = th.sigmoid(inputs * self.sensory_gain - self.sensory_threshold)
+        sensed = th.sigmoid(inputs * arrays.sensory_gain - self.sensory_threshold)
         current = th.tanh(inputs @ arrays.current_weight + self.current_bias)
         return th.cat([sensed, current], dim=-1) @ arrays.from_inputs + arrays.rest
 
@@ -114,7 +119,7 @@ class ConductanceCell(nn.Module):
         :param inertia: ``C / dt``, ``(n_neurons,)`` or ``(batch, n_neurons)``
         :return: the potentials one sub-step later
         """
-        released = th.sigmoid(potentials * self.gain - self.threshold)
+        released = th.sigmoid(potentials * arrays.gain - self.threshold)
         weighted, total = (drive + released @ arrays.recurrent).chunk(2, dim=-1)
         return (potentials * inertia + weighted) / total
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
+from torch.nn import functional
 
 if TYPE_CHECKING:
     from sb3_tbc.ndbc.network import NDBCNet
@@ -26,22 +27,26 @@ class FrozenNDBC:
         self.refresh()
 
     def refresh(self) -> None:
-        """Read the network's current weights."""
-        cell = self.net.cell
+        """Read the network's current weights.
+
+        The logistic function is taken as ``(1 + tanh(x / 2)) / 2``, one call instead of four; the halves are folded
+        into the matrices.
+        """
+        net, cell, m = self.net, self.net.cell, self.net.cell.n_inputs
+        self._sub_steps = net.sub_steps
         with th.no_grad():
             arrays = cell.arrays()
-            inertia = arrays.capacitance * self.net.sub_steps
-            self._current_weight = _numpy(self.net.input_gain.unsqueeze(-1) * arrays.current_weight)
-            self._from_inputs = _numpy(arrays.from_inputs)
-            self._recurrent = _numpy(arrays.recurrent)
-            self._rest = _numpy(arrays.rest + th.nn.functional.pad(inertia, (self.state_dim, 0)))
-            self._inertia = _numpy(inertia)
-            self._sensory_gain = _numpy(-self.net.input_gain * cell.sensory_gain)
-            self._readout = _numpy(self.net.readout_weight.T)
-            self._sensory_threshold, self._current_bias = _numpy(cell.sensory_threshold), _numpy(cell.current_bias)
-            self._gain, self._threshold = _numpy(-cell.gain), _numpy(cell.threshold)
-            self._readout_bias = _numpy(self.net.readout_bias)
-        self._sub_steps = self.net.sub_steps
+            inertia = arrays.capacitance * net.sub_steps
+            sensory, current = arrays.from_inputs[:m], arrays.from_inputs[m:]
+            half_sums = 0.5 * (sensory.sum(dim=0) + arrays.recurrent.sum(dim=0))
+            rest = arrays.rest + half_sums + functional.pad(inertia, (self.state_dim, 0))
+            excite = th.cat([th.diag(0.5 * arrays.sensory_gain), arrays.current_weight], dim=1)
+            self._excite = _numpy(net.input_gain.unsqueeze(-1) * excite)
+            self._excite_bias = _numpy(th.cat([-0.5 * cell.sensory_threshold, cell.current_bias]))
+            self._from_inputs, self._rest = _numpy(th.cat([0.5 * sensory, current])), _numpy(rest)
+            self._recurrent, self._inertia = _numpy(0.5 * arrays.recurrent), _numpy(inertia)
+            self._gain, self._threshold = _numpy(0.5 * arrays.gain), _numpy(0.5 * cell.threshold)
+            self._readout, self._readout_bias = _numpy(net.readout_weight.T), _numpy(net.readout_bias)
         self._read_from = self.state_dim - self._readout.shape[0]
 
     def __call__(self, inputs: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -52,24 +57,23 @@ class FrozenNDBC:
         :return: outputs ``(batch, n_outputs)`` and the next potentials
         """
         n = self.state_dim
-        sensed = np.exp(inputs * self._sensory_gain + self._sensory_threshold)
-        sensed += 1.0
-        np.reciprocal(sensed, out=sensed)
-        current = np.tanh(inputs @ self._current_weight + self._current_bias)
-        drive = np.concatenate((sensed, current), axis=1) @ self._from_inputs
+        recurrent, gain, threshold, inertia = self._recurrent, self._gain, self._threshold, self._inertia
+        excited = inputs.dot(self._excite)
+        excited += self._excite_bias
+        drive = np.tanh(excited, out=excited).dot(self._from_inputs)
         drive += self._rest
         for _ in range(self._sub_steps):
-            released = state * self._gain
-            released += self._threshold
-            np.exp(released, out=released)
-            released += 1.0
-            np.reciprocal(released, out=released)
-            total = released @ self._recurrent
+            released = state * gain
+            released -= threshold
+            total = np.tanh(released, out=released).dot(recurrent)
             total += drive
-            state = state * self._inertia
+            state = state * inertia
             state += total[:, :n]
             state /= total[:, n:]
-        return state[:, self._read_from :] @ self._readout + self._readout_bias, state
+        read = state if self._read_from == 0 else state[:, self._read_from :]
+        outputs = read.dot(self._readout)
+        outputs += self._readout_bias
+        return outputs, state
 
 
 def _numpy(tensor: th.Tensor) -> FloatArray:
