@@ -11,6 +11,7 @@ _CLASSES = {
     "Pendulum": "pendulum",
     "Drawbridge": "drawbridge",
     "UR5Reacher": "ur5_reacher",
+    "AntFourRooms": "ant_four_rooms",
 }
 TASKS = tuple(_CLASSES)
 """Names of the tasks; the id of each is ``sb3_tbc/<name>-v0``."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
@@ -9,10 +11,12 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import logger, spaces
 from gymnasium.error import ResetNeeded
-from gymnasium_robotics.core import GoalEnv
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_tbc.spaces import SubgoalSpace
+
+with contextlib.redirect_stderr(io.StringIO()):  # Importing it prints a notice about environments not used here.
+    from gymnasium_robotics.core import GoalEnv
 
 Array = NDArray[np.float64]
 Observation = dict[str, Array]
@@ -38,6 +42,8 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
     max_episode_steps: int
     """Steps after which an episode is truncated."""
+    success_terminates: bool = True
+    """Whether an episode ends with success; false only where the public implementation is followed to the letter."""
     achieved_in_observation: bool = True
     """Whether ``achieved_goal`` can be computed from ``observation``; if not, policies need to see it as well."""
     action_bound: ClassVar[tuple[float, ...]] = (1.0,)
@@ -136,7 +142,10 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         observation, achieved = self._observe(True)
         if self.render_mode == "human":
             self.render()
-        return self._package(observation, achieved), {"is_success": self._holds(achieved, self._goal_list)}
+        return (
+            {"observation": observation, "achieved_goal": np.array(achieved), "desired_goal": self._goal.copy()},
+            {"is_success": self._holds(achieved, self._goal_list)},
+        )
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Advance by one control step.
@@ -151,11 +160,16 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         self._elapsed += 1
         observation, achieved = self._observe(False)
         success = self._holds(achieved, self._goal_list)
-        truncated = self._elapsed >= self.max_episode_steps and not success
+        terminated = success and self.success_terminates
         if self.render_mode == "human":
             self.render()
-        reward = 0.0 if success else -1.0
-        return self._package(observation, achieved), reward, success, truncated, {"is_success": success}
+        return (
+            {"observation": observation, "achieved_goal": np.array(achieved), "desired_goal": self._goal.copy()},
+            0.0 if success else -1.0,
+            terminated,
+            self._elapsed >= self.max_episode_steps and not terminated,
+            {"is_success": success},
+        )
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
         """Sparse reward: 0 where the goal test holds, else -1.
@@ -170,7 +184,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
 
     def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
         """Whether the goal test holds: a bool, or an array for a batch. See :meth:`compute_reward`."""
-        success = self._holds_batch(*_goal_pair(achieved_goal, desired_goal))
+        success = self._holds_batch(*_goal_pair(achieved_goal, desired_goal)) & self.success_terminates
         return success if np.ndim(success) else bool(success)
 
     def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
@@ -217,13 +231,13 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
 
     def _holds(self, achieved: list[float], desired: list[float]) -> bool:
         """Goal test of one pair in plain Python; agrees with :meth:`_holds_batch` to the bit."""
-        return all(abs(a - d) <= t for a, d, t in zip(achieved, desired, self.goal_tolerance, strict=True))
+        for a, d, tolerance in zip(achieved, desired, self.goal_tolerance):  # noqa: B905 (strict=True takes 0.2 us)
+            if not abs(a - d) <= tolerance:
+                return False
+        return True
 
     def _holds_batch(self, achieved: Array, desired: Array) -> Any:
         return (np.abs(achieved - desired) <= self._tolerance).all(axis=-1)
-
-    def _package(self, observation: Array, achieved: list[float]) -> Observation:
-        return {"observation": observation, "achieved_goal": np.array(achieved), "desired_goal": self._goal.copy()}
 
     def _legal(self, action: ArrayLike) -> list[float]:
         """The action as plain floats inside the action space."""
@@ -233,7 +247,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
                 f"action must be numbers of shape {self._action_shape}, got shape {array.shape} of type {array.dtype}"
             )
         values: list[float] = array.tolist()
-        for value, limit in zip(values, self._action_limit, strict=True):
+        for value, limit in zip(values, self._action_limit):  # noqa: B905 (the shape is checked above)
             if not -limit <= value <= limit:
                 return self._clipped(array)
         return values

@@ -15,7 +15,7 @@ from .mujoco_task import MujocoTask
 
 MODEL = """
 <mujoco model="pendulum">
-  <option timestep="0.002" gravity="0 0 -9.81"><flag contact="disable"/></option>
+  <option timestep="0.002" gravity="0 0 -9.81"><flag constraint="disable"/></option>
   <worldbody>
     <body name="pole" pos="0 0 0.6">
       <inertial pos="0 0 0.5" mass="1" diaginertia="0.001 0.001 0.001"/>
