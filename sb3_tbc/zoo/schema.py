@@ -36,7 +36,7 @@ LEVEL: Schema = {
     "ent_coef": (int, float, str),
     "target_entropy": (int, float, str),
     "buffer_size": int,
-    "n_hindsight_goals": int,
+    "n_hindsight_goals": NUMBER,
     "policy_kwargs": POLICY,
 }
 RUN: Schema = {"n_timesteps": int, "n_envs": int, "env_kwargs": dict}
@@ -53,8 +53,11 @@ MODEL: Schema = {
     "duration_cost": NUMBER,
     "testing_fraction": NUMBER,
     "deterministic_testing": bool,
+    "testing_penalty": NUMBER,
+    "keep_original": bool,
     "random_fraction": NUMBER,
-    "n_hindsight_goals": int,
+    "n_hindsight_goals": NUMBER,
+    "goal_strategy": frozenset({"future", "episode"}),
     "gradient_ratio": NUMBER,
     "learning_starts": int,
     "memory": frozenset({"window", "episode", "none"}),

@@ -1,0 +1,143 @@
+"""``python -m sb3_tbc.train``: train an agent on a task and keep the run in a folder."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from sb3_tbc.cli import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.zoo.algorithms import algorithm
+from sb3_tbc.zoo.config import CONFIGS, load_config, parse_overrides
+from sb3_tbc.zoo.environments import resolve_env
+from sb3_tbc.zoo.ledger import RunFolder
+from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
+
+
+def build_parser() -> Parser:
+    """The command's arguments."""
+    parser = Parser("sb3_tbc.train", description=__doc__)
+    parser.add_argument("--algo", default="tbc-hrl", help="tbc-hrl or hits")
+    parser.add_argument("--env", default="Pendulum", help="a task's short name or any registered goal environment id")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--n-timesteps", type=positive_int, help="environment steps; by default the paper's (table 1)")
+    parser.add_argument("--n-envs", type=positive_int, help="parallel environments")
+    parser.add_argument("--config", choices=CONFIGS, help="the paper's values, or those tuned by measurement (default)")
+    parser.add_argument("--config-file", type=Path, help="another file with sections like those of zoo_configs")
+    parser.add_argument("--ablation", help="what to leave out: no-ts or no-ndbc")
+    parser.add_argument("--hyperparams", nargs="+", default=[], metavar="K:V", help="e.g. low.learning_rate:1e-3")
+    parser.add_argument("--eval-freq", type=positive_int, help="environment steps between evaluations")
+    parser.add_argument("--n-eval-episodes", type=positive_int, default=20, help="episodes of each evaluation")
+    parser.add_argument("--n-final-episodes", type=positive_int, default=100, help="episodes of the last evaluation")
+    parser.add_argument("--log-folder", type=Path, default=Path("runs"), help="runs go to <folder>/<task>/<algo>/...")
+    parser.add_argument("--variant", help="name of the run's folder; by default full, paper, or the ablation")
+    parser.add_argument("--overwrite", action="store_true", help="replace an earlier run in the same folder")
+    parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with the run in this folder")
+    parser.add_argument("--ledger", type=Path, metavar="FOLDER", help="copy the small result files there when done")
+    parser.add_argument("--device", default="cpu")
+    parser.add_argument("--num-threads", type=positive_int, default=1, help="more than one is slower on small networks")
+    parser.add_argument(
+        "--progress", action=argparse.BooleanOptionalAction, help="progress bar; default: on a terminal"
+    )
+    parser.add_argument("--tensorboard", action="store_true", help="write TensorBoard files into the run's folder")
+    parser.add_argument("--trace", action="store_true", help="write every option of training to options.csv")
+    parser.add_argument("--checkpoint-minutes", type=float, default=10.0, help="time between checkpoints for --resume")
+    parser.add_argument("--keep-checkpoint", action="store_true", help="keep the last checkpoint of a finished run")
+    return parser
+
+
+def build_spec(args: argparse.Namespace) -> RunSpec:
+    """From arguments to a run.
+
+    :raises ConfigError: for unknown names and wrong values
+    """
+    algorithm(args.algo)
+    task, env_id = resolve_env(args.env)
+    overrides = parse_overrides(args.hyperparams)
+    run = load_config(args.algo, task, args.config, overrides, args.ablation, args.config_file)
+    run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
+    return RunSpec(
+        run,
+        env_id,
+        variant=args.variant or variant_name(args.ablation, run.config),
+        seed=args.seed,
+        eval_freq=args.eval_freq or max(run.n_timesteps // 40, 500),
+        n_eval_episodes=args.n_eval_episodes,
+        n_final_episodes=args.n_final_episodes,
+    )
+
+
+def variant_name(ablation: str | None, config: str) -> str:
+    """Folder name of a variant: ``full`` or the ablation, with ``-paper`` when the tables' values are used."""
+    return (ablation or "full") + ("-paper" if config == "paper" else "")
+
+
+def describe(result: dict[str, Any], folder: RunFolder) -> str:
+    """What to print at the end: the result, where everything lies, and how to evaluate it."""
+    low, high = result["success_ci95"]
+    lines = [
+        f"success rate   {result['success_rate']:.2f}  (95 % interval {low:.2f} to {high:.2f}, "
+        f"{result['n_episodes']} episodes, after {result['n_timesteps']:,} steps in {result['wall_time']:.0f} s)",
+        f"agent          {folder.model}",
+        f"best agent     {folder.best_model}" if folder.best_model.is_file() else "best agent     (not evaluated)",
+        f"learning curve {folder.evaluations}",
+        f"evaluate       {Path(sys.executable).name} -m sb3_tbc.evaluate {shlex.quote(str(folder.model))}",
+    ]
+    return "\n".join(lines)
+
+
+def command(argv: Sequence[str]) -> int:
+    """Train; see ``--help``."""
+    args = build_parser().parse_args(argv)
+    th.set_num_threads(args.num_threads)
+    stop_like_ctrl_c()
+    options = RunOptions(
+        device=args.device,
+        progress=sys.stderr.isatty() if args.progress is None else args.progress,
+        tensorboard=args.tensorboard,
+        trace=args.trace,
+        checkpoint_seconds=60.0 * args.checkpoint_minutes,
+        keep_checkpoint=args.keep_checkpoint,
+    )
+    try:
+        folder, result = _run(args, options, argv)
+    except Interrupted as stopped:
+        print(f"\n{stopped}; go on with: python -m sb3_tbc.train --resume {stopped.folder}", file=sys.stderr)
+        return INTERRUPTED
+    print(describe(result, folder))
+    if args.ledger is not None:
+        target = _ledger_folder(args.ledger, result)
+        folder.copy_to(target)
+        print(f"ledger         {target.path}")
+    return 0
+
+
+def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> tuple[RunFolder, dict[str, Any]]:
+    if args.resume is not None:
+        folder = RunFolder(args.resume)
+        return folder, resume_run(folder, options, args.n_timesteps)
+    spec = build_spec(args)
+    folder = RunFolder.of(args.log_folder, spec.run.task, spec.run.algo, spec.variant, spec.seed)
+    line = shlex.join(["python", "-m", "sb3_tbc.train", *argv])
+    if args.ledger is not None:
+        _ledger_folder(args.ledger, spec.identity).require_empty()
+    return folder, start_run(spec, folder, line, options, args.overwrite)
+
+
+def _ledger_folder(ledger: Path, identity: dict[str, Any]) -> RunFolder:
+    return RunFolder.of(ledger, identity["task"], identity["algo"], identity["variant"], identity["seed"])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    return run_command(command, "sb3_tbc.train", argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

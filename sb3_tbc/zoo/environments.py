@@ -1,0 +1,89 @@
+"""From a name on the command line to goal environments."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Mapping
+from typing import Any
+
+import gymnasium as gym
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecEnv
+
+import sb3_tbc  # noqa: F401  (registers the tasks)
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.zoo.schema import nearest
+
+NAMESPACE = "sb3_tbc/"
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+
+def task_names() -> dict[str, str]:
+    """Short task names and their environment ids."""
+    ids = sorted(i for i in gym.registry if i.startswith(NAMESPACE))
+    return {i.removeprefix(NAMESPACE).rpartition("-v")[0]: i for i in ids}
+
+
+def resolve_env(name: str) -> tuple[str, str]:
+    """Task name and environment id of ``Pendulum``, ``sb3_tbc/Pendulum-v0``, any registered id, or ``module:id``.
+
+    :raises ConfigError: naming the nearest known one
+    """
+    tasks = task_names()
+    if name in tasks:
+        return name, tasks[name]
+    module, separator, env_id = name.rpartition(":")
+    if separator:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise ConfigError(f"cannot import module {module!r} of environment {name!r}: {error}") from error
+    if env_id in gym.registry:
+        short = {i: task for task, i in tasks.items()}
+        return short.get(env_id, env_id), env_id
+    raise ConfigError(f"unknown environment {name!r}; {nearest(name, _known(name, tasks))}")
+
+
+def _known(name: str, tasks: Mapping[str, str]) -> list[str]:
+    """What to suggest: an id for something that looks like an id, else our short names."""
+    return [*tasks, *gym.registry] if "-v" in name or "/" in name else list(tasks)
+
+
+def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[str, Any] | None = None) -> VecEnv:
+    """A vector of monitored goal environments in this process.
+
+    :param env_id: as registered
+    :param n_envs: how many
+    :param seed: environment ``i`` gets ``seed + i``
+    :param env_kwargs: for ``gymnasium.make``
+    :raises ConfigError: if it cannot be made, is no goal environment, or its actions are not a Box
+    """
+    try:
+        env = make_vec_env(env_id, n_envs, seed=seed, env_kwargs=dict(env_kwargs or {}))
+    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
+        raise ConfigError(f"cannot make environment {env_id!r} with {dict(env_kwargs or {})}: {error}") from error
+    try:
+        check_goal_env(env, env_id)
+    except ConfigError:
+        env.close()
+        raise
+    return env
+
+
+def check_goal_env(env: VecEnv, env_id: str) -> None:
+    """Refuse what a hierarchical agent cannot act in.
+
+    :raises ConfigError: naming what is missing
+    """
+    space = env.observation_space
+    missing = [k for k in GOAL_KEYS if not isinstance(space, spaces.Dict) or k not in space.spaces]
+    if missing:
+        raise ConfigError(
+            f"{env_id!r} is not a goal environment: its observation has no {', '.join(missing)}; "
+            f"use one derived from gymnasium_robotics.core.GoalEnv, e.g. {', '.join(task_names())}"
+        )
+    if not isinstance(env.action_space, spaces.Box):
+        raise ConfigError(
+            f"{env_id!r} has actions {env.action_space}, but only a Box (continuous actions) is supported"
+        )

@@ -1,0 +1,265 @@
+"""Run folders and the results ledger: small text files that say what was run, how, and what came out."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+import shutil
+import subprocess
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch as th
+import yaml
+from numpy.typing import NDArray
+
+from sb3_tbc.callbacks import EvaluationRow, finite_mean, read_evaluations, write_atomic, write_evaluations
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.stats import stability, wilson_interval
+
+CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL = (
+    "config.yml",
+    "command.txt",
+    "versions.json",
+    "evaluations.csv",
+    "final.json",
+)
+LEDGER_FILES = (CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL)
+SOURCES = (":/sb3_tbc", ":/tasks", ":/zoo_configs")
+PACKAGES = (
+    "sb3_tbc",
+    "stable_baselines3",
+    "torch",
+    "numpy",
+    "scipy",
+    "gymnasium",
+    "gymnasium_robotics",
+    "mujoco",
+    "box2d",
+    "pybullet",
+)
+
+
+class Episodes(Protocol):
+    """Per-episode arrays of an evaluation, each ``(n_episodes,)``; lengths and windows in environment steps."""
+
+    @property
+    def successes(self) -> NDArray[Any]:
+        """Whether the episode succeeded."""
+
+    @property
+    def lengths(self) -> NDArray[Any]:
+        """Steps."""
+
+    @property
+    def subgoal_success(self) -> NDArray[Any]:
+        """Share of the episode's windows that reached their subgoal."""
+
+    @property
+    def mean_window(self) -> NDArray[Any]:
+        """Mean executed window of the episode."""
+
+
+def summarise(result: Episodes) -> dict[str, Any]:
+    """What ``evaluate --json`` and ``final.json`` say of an evaluation; undefined means are ``None``, never NaN."""
+    successes = np.asarray(result.successes, dtype=bool)
+    lengths = np.asarray(result.lengths, dtype=np.float64)
+    low, high = wilson_interval(int(successes.sum()), len(successes))
+    return {
+        "n_episodes": len(successes),
+        "success_rate": float(successes.mean()),
+        "success_ci95": [low, high],
+        "mean_length": _number(finite_mean(lengths)),
+        "mean_length_success": _number(finite_mean(lengths[successes])),
+        "subgoal_success": _number(finite_mean(result.subgoal_success)),
+        "mean_window": _number(finite_mean(result.mean_window)),
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def to_json(data: Mapping[str, Any]) -> str:
+    """JSON with a final newline; refuses NaN, which other readers do not understand."""
+    return json.dumps(data, indent=2, allow_nan=False) + "\n"
+
+
+def versions() -> dict[str, Any]:
+    """Packages, commit, Python and processor that a result depends on."""
+    packages = {}
+    for name in PACKAGES:
+        try:
+            packages[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "packages": packages,
+        "commit": _commit(),
+        "python": platform.python_version(),
+        "platform": platform.platform(),
+        "cpu": _cpu(),
+        "torch_threads": th.get_num_threads(),
+    }
+
+
+def _commit() -> str | None:
+    """Commit of the checkout the package runs from, with ``+`` if files differ from it; ``None`` outside a checkout."""
+    folder = Path(__file__).parent
+    try:
+        where = ["git", "-C", str(folder)]
+        tracked = subprocess.run([*where, "ls-files", "--error-unmatch", __file__], capture_output=True, timeout=10)
+        if tracked.returncode != 0:
+            return None
+        commit = subprocess.run([*where, "rev-parse", "HEAD"], capture_output=True, text=True, timeout=10)
+        changed = subprocess.run([*where, "diff", "--quiet", "HEAD", "--", *SOURCES], timeout=30)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return commit.stdout.strip() + ("+" if changed.returncode else "")
+
+
+def _cpu() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The files of one run: ``<root>/<task>/<algo>/<variant>/seed_<n>/``."""
+
+    path: Path
+
+    @classmethod
+    def of(cls, root: Path, task: str, algo: str, variant: str, seed: int) -> RunFolder:
+        """The folder a run belongs in; slashes and colons of environment ids become underscores."""
+        return cls(root / task.replace("/", "_").replace(":", "_") / algo / variant / f"seed_{seed}")
+
+    @property
+    def model(self) -> Path:
+        """The agent at the end of training."""
+        return self.path / "model.zip"
+
+    @property
+    def best_model(self) -> Path:
+        """The agent with the best evaluation."""
+        return self.path / "best_model.zip"
+
+    @property
+    def checkpoint(self) -> Path:
+        """Folder with what ``--resume`` needs."""
+        return self.path / "checkpoint"
+
+    @property
+    def evaluations(self) -> Path:
+        """The learning curve."""
+        return self.path / EVALUATIONS
+
+    @property
+    def exists(self) -> bool:
+        """Whether a run has been started here."""
+        return (self.path / CONFIG).is_file()
+
+    @property
+    def finished(self) -> bool:
+        """Whether a run has ended here."""
+        return (self.path / FINAL).is_file()
+
+    def start(self, config: Mapping[str, Any], command: str) -> None:
+        """Write what is known before training: configuration, command, versions."""
+        write_atomic(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
+        write_atomic(self.path / COMMAND, command + "\n")
+        write_atomic(self.path / VERSIONS, to_json(versions()))
+
+    def clear(self) -> None:
+        """Remove the files of an earlier run, and nothing else that may lie in the folder."""
+        for name in (*LEDGER_FILES, self.model.name, self.best_model.name, "progress.csv", "options.csv"):
+            (self.path / name).unlink(missing_ok=True)
+        shutil.rmtree(self.checkpoint, ignore_errors=True)
+
+    def read_config(self) -> dict[str, Any]:
+        """The configuration the run was started with.
+
+        :raises ConfigError: if there is none or it cannot be read
+        """
+        return _read(self.path / CONFIG, yaml.safe_load)
+
+    def read_final(self) -> dict[str, Any]:
+        """The result.
+
+        :raises ConfigError: if there is none or it cannot be read
+        """
+        return _read(self.path / FINAL, json.loads)
+
+    def read_evaluations(self) -> list[EvaluationRow]:
+        """The learning curve, empty before the first evaluation."""
+        return read_evaluations(self.evaluations)
+
+    def drop_evaluations_after(self, timesteps: int) -> None:
+        """Forget evaluations that a resumed run will make again."""
+        rows = self.read_evaluations()
+        if any(row.timesteps > timesteps for row in rows):
+            write_evaluations(self.evaluations, [row for row in rows if row.timesteps <= timesteps])
+
+    def keep_progress(self, timesteps: int) -> None:
+        """Put SB3's ``progress.csv`` aside before a resumed run begins another."""
+        progress = self.path / "progress.csv"
+        if progress.is_file():
+            progress.rename(self.path / f"progress_until_{timesteps}.csv")
+
+    def finish(self, result: Mapping[str, Any]) -> None:
+        """Write the result, which marks the run as done."""
+        write_atomic(self.path / FINAL, to_json(result))
+
+    def require_empty(self) -> None:
+        """Refuse a folder that holds a result.
+
+        :raises ConfigError: if it does
+        """
+        if self.finished:
+            raise ConfigError(f"{self.path} already holds a result; remove it first or use --variant")
+
+    def copy_to(self, target: RunFolder) -> None:
+        """Copy the small text files, e.g. into the committed ledger.
+
+        :raises ConfigError: if another result lies there
+        """
+        target.require_empty()
+        for name in LEDGER_FILES:
+            write_atomic(target.path / name, (self.path / name).read_text(encoding="utf-8"))
+
+
+def _read(path: Path, parse: Any) -> dict[str, Any]:
+    try:
+        data = parse(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(f"{path.parent} holds no run: {path.name} is missing") from error
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ConfigError(f"cannot read {path}: {error}") from error
+    if not isinstance(data, dict):
+        raise ConfigError(f"{path} must hold named values, got {type(data).__name__}")
+    return data
+
+
+def curve_summary(rows: list[EvaluationRow]) -> dict[str, Any]:
+    """Best evaluation and stability of a curve: share at 0.9 or more from the first such one on, and the worst."""
+    if not rows:
+        return {"best_success_rate": None, "stable_share": None, "worst_after_first_90": None}
+    rates = [row.success_rate for row in rows]
+    share, worst = stability(rates) or (None, None)
+    return {"best_success_rate": max(rates), "stable_share": share, "worst_after_first_90": worst}
+
+
+def finished_runs(root: Path) -> Iterator[RunFolder]:
+    """All runs with a result below a folder, in order of their paths."""
+    for path in sorted(root.glob(f"*/*/*/seed_*/{FINAL}")):
+        yield RunFolder(path.parent)
