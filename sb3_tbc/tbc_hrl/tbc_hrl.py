@@ -439,6 +439,12 @@ class TBCHRL(BaseAlgorithm):
             variables += [f"{name}.{part}" for part in level_variables]
         return state_dicts, variables
 
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """Load parameters of both levels in place, see SB3."""
+        super().set_parameters(*args, **kwargs)
+        for level in (self.high, self.low):
+            level.refresh()
+
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write both levels' replay buffers to one file of plain arrays, atomically."""
         arrays = {
