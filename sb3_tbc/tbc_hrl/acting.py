@@ -9,17 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_tbc.tbc_hrl.policies import GaussianHead, MLPActor, NDBCActor
+from sb3_tbc.tbc_hrl.policies import GaussianHead, LevelPolicy, MLPActor, NDBCActor
 
-FloatArray = NDArray[np.float32]
+FloatArray = NDArray[np.floating[Any]]
+"""float32 in all that is given and returned here."""
 
 
 def _relu(x: FloatArray) -> FloatArray:
-    return np.maximum(x, 0.0, out=x)
+    np.maximum(x, 0.0, out=x)
+    return x
 
 
 def _silu(x: FloatArray) -> FloatArray:
-    return x * (0.5 + 0.5 * np.tanh(0.5 * x))
+    return np.asarray(x * (0.5 + 0.5 * np.tanh(0.5 * x)))
 
 
 def _elu(x: FloatArray) -> FloatArray:
@@ -37,7 +39,7 @@ ACTIVATIONS: dict[type[nn.Module], Callable[[Any], Any]] = {
 class FrozenNet(Protocol):
     """A network's outputs and next state for one control step, in NumPy."""
 
-    def __call__(self, observations: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def __call__(self, inputs: FloatArray, state: FloatArray, /) -> tuple[FloatArray, FloatArray]:
         """Outputs ``(n, 2 * action_dim)`` and next states ``(n, state_dim)``."""
 
     def refresh(self) -> None:
@@ -88,24 +90,26 @@ def freeze(actor: MLPActor | NDBCActor) -> FrozenNet:
     if isinstance(actor, NDBCActor):
         from sb3_tbc.ndbc.frozen import FrozenNDBC
 
-        net: FrozenNet = FrozenNDBC(actor.net)
-        return net
+        return FrozenNDBC(actor.net)
     return FrozenMLP(actor)
 
 
 class FrozenActor:
-    """Acts in NumPy from an actor's weights, read when :meth:`refresh` was last due.
+    """Acts in NumPy from an actor's weights, which it reads again when the policy's ``weights_version`` has changed.
 
-    :param actor: actor of a level whose parameters are in flat storage
+    :param policy: policy of a level, its parameters in flat storage
+    :param average: act from the averaged actor
     """
 
-    def __init__(self, actor: MLPActor | NDBCActor) -> None:
+    def __init__(self, policy: LevelPolicy, average: bool) -> None:
+        actor = policy.average_actor if average else policy.actor
+        self._policy = policy
+        self._version = policy.weights_version
         self._net = freeze(actor)
         head: GaussianHead = actor.head
         self._mean_bound = head.mean_bound
         self._low, self._high = head.log_std_bounds
         self._dim = int(np.prod(actor.action_space.shape))
-        self.stale = False
 
     def act(
         self, observations: FloatArray, states: FloatArray, deterministic: bool, rng: np.random.Generator
@@ -117,9 +121,9 @@ class FrozenActor:
         :param deterministic: the squashed mean instead of a sample
         :param rng: source of the noise
         """
-        if self.stale:
+        if self._version != self._policy.weights_version:
             self._net.refresh()
-            self.stale = False
+            self._version = self._policy.weights_version
         outputs, next_states = self._net(observations, states)
         dim, bound = self._dim, self._mean_bound
         mean = outputs[:, :dim]

@@ -21,7 +21,7 @@ from sb3_tbc.tbc_hrl.policies import LevelPolicy
 from sb3_tbc.tbc_hrl.update import SACUpdate
 from sb3_tbc.type_aliases import LevelBatch
 
-FloatArray = NDArray[np.float32]
+FloatArray = NDArray[np.floating[Any]]
 
 BURST = 128
 """Updates whose batches are gathered at once; bounds the memory of a long burst."""
@@ -143,7 +143,7 @@ class SACLevel(SAC):
             self.ent_coef_optimizer.state[self.log_ent_coef] = {"step": th.tensor(0.0), **zeros}
         self.noise_rng = np.random.default_rng(self.seed)
         self._update = SACUpdate(self.policy, self.ent_coef_optimizer, self.compile)
-        self._frozen = {False: FrozenActor(self.policy.actor), True: FrozenActor(self.policy.average_actor)}
+        self._frozen = {average: FrozenActor(self.policy, average) for average in (False, True)}
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_update", "_frozen"]
@@ -202,7 +202,7 @@ class SACLevel(SAC):
         self.logger.record(self.log_prefix + "learning_rate", learning_rate)
 
     def _check_finite(self) -> None:
-        vectors = {"actor": self._update.actor.vector, "critic": self._update.critic.vector}
+        vectors: dict[str, th.Tensor] = {"critic": self._update.critic.vector, "actor": self._update.actor.vector}
         if self.log_ent_coef is not None:
             vectors["log_ent_coef"] = self.log_ent_coef
         for module, vector in vectors.items():
@@ -223,14 +223,8 @@ class SACLevel(SAC):
         )
 
     def refresh(self) -> None:
-        """Make the next :meth:`act` read the weights again; needed after changing them other than by ``train``."""
-        for frozen in self._frozen.values():
-            frozen.stale = True
-
-    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """Load parameters in place, see SB3."""
-        super().set_parameters(*args, **kwargs)
-        self.refresh()
+        """Make the next :meth:`act` read the weights again; needed after changing them by hand."""
+        self.policy.weights_version += 1
 
     def act(
         self,

@@ -91,6 +91,10 @@ class MLPActor(Actor):
         mean, log_std = self.head(th.cat((self.mu(latent), self.log_std(latent)), dim=-1))  # type: ignore[operator]
         return mean, log_std, state
 
+    def constants(self) -> list[th.Tensor]:
+        """None: an MLP has no tensors besides its parameters."""
+        return []
+
     def blocks(self) -> list[Block]:
         """Layers' weights and biases; mean and log_std share one output layer."""
         blocks = [Block(tuple(p.shape), (p,)) for layer in linear_layers(self.latent_pi) for p in layer.parameters()]
@@ -123,8 +127,8 @@ class MLPActor(Actor):
 class NDBCActor(BasePolicy):
     """Squashed Gaussian actor whose mean and log_std are read out of an NDBC circuit.
 
-    :param ndbc: the wiring's numbers (``inter``, ``command``, ``motor``, fan-outs, ``seed``) and the network's options
-        (``sub_steps``, ``dynamics``, ``input_scale``, ...)
+    :param ndbc: the wiring's numbers (``inter``, ``command``, ``motor``, fan-outs, ``seed`` of the wiring) and the
+        network's options (``sub_steps``, ``dynamics``, ``input_scale``, ...); weights are drawn from torch's generator
     :param mean_bound: see :class:`GaussianHead`
     :param log_std_bounds: see :class:`GaussianHead`
     """
@@ -145,7 +149,7 @@ class NDBCActor(BasePolicy):
         super().__init__(
             observation_space,
             action_space,
-            features_extractor=features_extractor,  # type: ignore[arg-type]
+            features_extractor=features_extractor,
             normalize_images=normalize_images,
             squash_output=True,
         )
@@ -154,6 +158,7 @@ class NDBCActor(BasePolicy):
         self.ndbc = dict(ndbc)
         wiring = NDBCWiring(features_dim, **{k: v for k, v in self.ndbc.items() if k in WIRING_KEYS})
         options = {k: v for k, v in self.ndbc.items() if k not in WIRING_KEYS}
+        options.setdefault("seed", int(th.randint(2**31, ())))  # follows the run's seed, as the MLP's weights do
         self.net = NDBCNet(features_dim, 2 * get_action_dim(action_space), wiring, **options)
         self.state_dim = int(self.net.state_dim)
         self.head = GaussianHead(mean_bound, log_std_bounds)
@@ -242,7 +247,7 @@ class LevelCritic(ContinuousCritic):
         inputs = th.cat((obs, actions), dim=-1)
         weight, bias = blocks[0], blocks[1]
         first = functional.linear(inputs, weight.flatten(0, 1), bias.flatten())
-        values = first.unflatten(-1, (len(weight), weight.shape[1])).transpose(0, 1)
+        values = first.view(-1, len(weight), weight.shape[1]).transpose(0, 1)
         for weight, bias in zip(blocks[2::2], blocks[3::2], strict=True):
             values = th.baddbmm(bias, self.activation(values), weight.transpose(1, 2))
         return functional.logsigmoid(values) if self.negative else values
@@ -266,6 +271,8 @@ class LevelPolicy(SACPolicy):
     critic: LevelCritic
     critic_target: LevelCritic
     average_actor: MLPActor | NDBCActor
+    weights_version: int = 0
+    """Grows whenever the weights change; what was derived from older weights is stale."""
 
     def __init__(
         self,
@@ -297,6 +304,12 @@ class LevelPolicy(SACPolicy):
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {**super()._get_constructor_parameters(), **self.level_kwargs}
+
+    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
+        """Load weights in place, see torch."""
+        result = super().load_state_dict(*args, **kwargs)
+        self.weights_version += 1
+        return result
 
     def make_actor(self, features_extractor: Any = None) -> MLPActor | NDBCActor:  # type: ignore[override]
         """Build the actor that ``ndbc`` asks for."""

@@ -83,7 +83,7 @@ class FlatParameters:
 
     def unflatten(self, vector: th.Tensor) -> list[th.Tensor]:
         """Views of a vector in the blocks' shapes; differentiable."""
-        return [part.view(shape) for part, shape in zip(vector.split(self.sizes), self.shapes, strict=True)]
+        return [part.view(shape) for part, shape in zip(th.split(vector, self.sizes), self.shapes, strict=True)]
 
 
 def flat_adam(parameter: th.Tensor, template: th.optim.Optimizer) -> th.optim.Adam:
@@ -202,8 +202,7 @@ class SACUpdate:
             moments = self._adam_state(optimizer)
             yield moments["exp_avg"]
             yield moments["exp_avg_sq"]
-        if hasattr(self.policy.actor, "constants"):
-            yield from self.policy.actor.constants()
+        yield from self.policy.actor.constants()
 
     def _schedules(self, n_steps: int, tau: float, target_entropy: float) -> th.Tensor:
         """A row of :class:`Schedules` per update."""
