@@ -87,9 +87,15 @@ def describe(result: dict[str, Any], folder: RunFolder) -> str:
         f"agent          {folder.model}",
         f"best agent     {folder.best_model}" if folder.best_model.is_file() else "best agent     (not evaluated)",
         f"learning curve {folder.evaluations}",
-        f"evaluate       {Path(sys.executable).name} -m sb3_tbc.evaluate {shlex.quote(str(folder.model))}",
+        f"evaluate       {_python()} -m sb3_tbc.evaluate {shlex.quote(str(folder.model))}",
     ]
     return "\n".join(lines)
+
+
+def _python() -> str:
+    """Return this interpreter as the user would type it: short when it lies below the working directory."""
+    path = Path(sys.executable)
+    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else "python"
 
 
 def command(argv: Sequence[str]) -> int:
