@@ -12,6 +12,7 @@ _CLASSES = {
     "Drawbridge": "drawbridge",
     "UR5Reacher": "ur5_reacher",
     "AntFourRooms": "ant_four_rooms",
+    "Platforms": "platforms",
 }
 TASKS = tuple(_CLASSES)
 """Names of the tasks; the id of each is ``sb3_tbc/<name>-v0``."""
