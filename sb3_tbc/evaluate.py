@@ -1,4 +1,4 @@
-"""``python -m sb3_tbc.evaluate``: success rate of a saved agent with its interval, subgoals, windows; video on request."""
+"""``python -m sb3_tbc.evaluate``: success rate of a saved agent with its interval, subgoals, windows; video too."""
 
 from __future__ import annotations
 

@@ -143,7 +143,7 @@ def stability(success_rates: Sequence[float], threshold: float = 0.9) -> tuple[f
     return float((after >= threshold).mean()), float(after.min())
 
 
-def steps_to(timesteps: Sequence[int], success_rates: Sequence[float], threshold: float) -> int | None:
+def steps_to(timesteps: Sequence[float], success_rates: Sequence[float], threshold: float) -> int | None:
     """Environment steps at the first evaluation at or above ``threshold``, or ``None``."""
     for steps, rate in zip(timesteps, success_rates, strict=True):
         if rate >= threshold:

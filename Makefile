@@ -1,0 +1,74 @@
+# From a fresh clone: `make train` or `make test`; nothing else is needed. `make help` lists the rest.
+SHELL = /bin/bash
+PYTHON ?= python3
+VENV = .venv
+BIN = $(VENV)/bin
+export OMP_NUM_THREADS ?= 1
+
+ENV ?= Pendulum
+ALGO ?= tbc-hrl
+SEED ?= 0
+STEPS ?= $(if $(filter Pendulum,$(ENV)),60000,)
+RUN := runs/$(shell date +%Y%m%d-%H%M%S)
+
+.PHONY: help install train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks bench clean
+
+help:
+	@echo "install          .venv with the package (editable) and what its tests need"
+	@echo "train            train TBC-HRL, evaluate it, write a report [ENV= STEPS= SEED= ALGO=]"
+	@echo "test             install, then the fast test suite"
+	@echo "pytest           the fast tests alone        pytest-slow  all tests"
+	@echo "type lint        mypy, ruff                  format       ruff format and fixes"
+	@echo "check-codestyle  format and lint, no change  commit-checks format type lint"
+	@echo "doc notebooks    build the pages, run the notebooks        bench  steps per second"
+
+# The stamp is newer than the files that decide what is installed: nothing is done twice.
+$(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
+	@scripts/system-packages.sh
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --editable '.[tests]' --constraint constraints.txt
+	@touch $@
+
+install: $(VENV)/.installed
+
+train: install
+	$(BIN)/python -m sb3_tbc.train --algo $(ALGO) --env $(ENV) --seed $(SEED) $(if $(STEPS),--n-timesteps $(STEPS)) \
+	    --log-folder $(RUN) --progress
+	$(BIN)/python -m sb3_tbc.report $(RUN) --html $(RUN)/report.html
+
+test: install pytest
+
+pytest:
+	$(BIN)/python -m pytest
+
+pytest-slow:
+	$(BIN)/python -m pytest -m "slow or not slow"
+
+type:
+	$(BIN)/mypy
+
+lint:
+	$(BIN)/ruff check .
+
+format:
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+check-codestyle:
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+commit-checks: format type lint
+
+doc: install
+	$(BIN)/python -m pip install --quiet --editable '.[docs]' --constraint constraints.txt
+	$(BIN)/sphinx-build -W -b html docs docs/_build/html
+
+notebooks: install
+	$(BIN)/python -m pytest -m "slow or not slow" tests/test_notebooks.py
+
+bench: install
+	$(BIN)/python scripts/bench.py
+
+clean:
+	rm -rf build dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis
