@@ -1,0 +1,198 @@
+"""Hindsight worked by hand on one short episode."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from corridor import Corridor
+
+from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
+from sb3_tbc.hindsight import (
+    GoalTest,
+    HighLevelReward,
+    HindsightSettings,
+    goal_pairs,
+    high_level_steps,
+    low_level_steps,
+    ordered_pairs,
+    relabel_actions,
+    relabel_goals,
+)
+from sb3_tbc.options import Episode, Option, OptionRules, TerminationReason
+from sb3_tbc.vec_env.hierarchical_vec_env import LevelLayout
+
+ENV = Corridor()
+RULES = OptionRules(dt_max=4.0, max_options=5)
+LAYOUT = LevelLayout(ENV.subgoals, True)
+GOALS = GoalTest(lambda a, d: ENV.compute_reward(a, d, {}), lambda a, d: ENV.compute_terminated(a, d, {}))
+
+
+def option(start: int, duration: int, subgoal: float, budget: float, testing: bool, reached: bool) -> Option:
+    unit = np.array([subgoal, 2 * budget / 4.0 - 1])
+    reason = TerminationReason.REACHED if reached else TerminationReason.EXPIRED
+    return Option(start, duration, unit, np.array([subgoal]), budget, testing, reached, reason)
+
+
+def episode() -> Episode:
+    """Two windows to the right, 0 -> 0.3 -> 0.5: the first (3 steps, to 0.9) fails its test, the second reaches 0.5."""
+    position = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
+    rows = np.stack([position, np.arange(6.0), np.ones(6)], axis=1).astype(np.float32)
+    return Episode(
+        observation=rows,
+        achieved_goal=position[:, None],
+        desired_goal=np.full((6, 1), 0.5),
+        local=rows,
+        actions=np.ones((5, 1), np.float32),
+        states=np.zeros((5, 2), np.float32),
+        next_states=np.ones((5, 2), np.float32),
+        rewards=np.array([-1.0, -1, -1, -1, 0]),
+        options=(option(0, 3, 0.9, 2.5, True, False), option(3, 2, 0.5, 1.5, False, True)),
+        terminated=True,
+        success=True,
+    )
+
+
+def test_low_level_transitions_of_two_windows() -> None:
+    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    np.testing.assert_array_equal(steps.position, [0, 1, 2, 0, 1])
+    np.testing.assert_array_equal(steps.length, [3, 3, 3, 2, 2])
+    np.testing.assert_array_equal(steps.time_left, [2.5, 1.5, 0.5, 1.5, 0.5])
+    np.testing.assert_array_equal(steps.dones, [False, False, True, False, True])
+    np.testing.assert_array_equal(steps.rewards, [0, 0, 0, 0, 1])
+    np.testing.assert_allclose(steps.achieved[:, 0], [0.1, 0.2, 0.3, 0.4, 0.5])
+
+
+def test_window_cut_by_the_episode_is_not_over_for_the_low_level() -> None:
+    cut = episode()._replace(options=(option(0, 3, 0.9, 2.5, True, False), option(3, 2, -0.5, 3.5, False, False)))
+    assert not low_level_steps(cut, ENV.subgoals, RULES).dones[-1]
+
+
+def test_failed_option_becomes_the_one_that_was_achieved() -> None:
+    actions, failed = relabel_actions(episode(), ENV.subgoals, RULES, np.random.default_rng(0))
+    np.testing.assert_array_equal(failed, [True, False])
+    assert actions[0, 0] == pytest.approx(0.3)
+    assert 2.0 < RULES.budget(actions[0, 1:])[0] <= 3.0  # expires at the third step
+    np.testing.assert_array_equal(actions[1], episode().options[1].unit_action)
+
+
+def test_goal_pairs_never_use_an_options_own_outcome_nor_the_past() -> None:
+    pairs = goal_pairs(4, 3, "future", np.random.default_rng(0))
+    assert (pairs[:, 1] > pairs[:, 0]).all()
+    assert np.bincount(pairs[:, 0], minlength=4).tolist() == [3, 2, 1, 0]
+    anywhere = goal_pairs(4, 3, "episode", np.random.default_rng(0))
+    assert np.bincount(anywhere[:, 0]).tolist() == [3, 3, 3, 3]
+    with pytest.raises(ValueError, match="final"):
+        goal_pairs(4, 3, "final", np.random.default_rng(0))
+
+
+def test_relabelled_goal_met_inside_a_window_ends_it_there() -> None:
+    reward = HighLevelReward("smdp", 1.0, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
+    starts, durations = np.array([0, 0, 3]), np.array([3, 3, 2])
+    copies = relabel_goals(episode(), starts, durations, np.array([[0.2], [0.9], [0.5]]), reward, GOALS)
+    np.testing.assert_array_equal(copies.dones, [True, False, True])
+    np.testing.assert_array_equal(copies.durations, [2, 3, 2])
+    np.testing.assert_allclose(copies.rewards, [-1 / 2 - 1, -3 / 2 - 1, -1 / 2 - 1])
+    hits = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0)
+    at_the_end = relabel_goals(episode(), starts, durations, np.array([[0.2], [0.3], [0.5]]), hits, GOALS)
+    np.testing.assert_array_equal(at_the_end.dones, [False, True, True])
+    np.testing.assert_array_equal(at_the_end.rewards, [-1, 0, 0])
+
+
+def test_all_high_level_transitions_by_hand() -> None:
+    reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=2.0)
+    settings = HindsightSettings(n_goals=1, goal_strategy="future", testing_penalty=-5.0, keep_original=False)
+    steps = high_level_steps(
+        episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0)
+    )
+    # failed test, two hindsight actions, one goal copy (the first option with the second's outcome)
+    assert len(steps.rewards) == 4
+    assert steps.rewards[0] == -5.0
+    assert steps.actions[0, 0] == pytest.approx(0.9)
+    took = RULES.budget(steps.actions[1, 1:])[0]
+    np.testing.assert_allclose(steps.rewards[1:], [-1 - 2 * took / 4, 0 - 2 * 1.5 / 4, -1 - 2 * took / 4])
+    np.testing.assert_array_equal(steps.dones, [False, False, True, False])
+    np.testing.assert_array_equal(steps.relabelled, [False, True, False, True])
+    np.testing.assert_allclose(steps.observations[3, 0], 0.5)  # the goal comes first in the high level's view
+    np.testing.assert_allclose(steps.discounts, 0.9)
+
+
+def test_ordered_pairs_are_uniform() -> None:
+    rng = np.random.default_rng(0)
+    first, second = ordered_pairs(np.full(60_000, 3), rng)
+    counts = np.bincount(first * 3 + second, minlength=9)
+    assert counts[[3, 6, 7]].sum() == 0
+    np.testing.assert_allclose(counts[[0, 1, 2, 4, 5, 8]] / 60_000, 1 / 6, atol=0.01)
+
+
+def low_buffer(size: int, hindsight: float, rules: OptionRules = RULES) -> SubgoalReplayBuffer:
+    return SubgoalReplayBuffer(
+        size, LAYOUT.low_space(), ENV.action_space, ENV.subgoals, rules, 2, 0.99, hindsight, seed=0
+    )
+
+
+def test_relabelled_low_level_samples_are_consistent() -> None:
+    buffer = low_buffer(100, hindsight=1e9)
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    batch = buffer.sample_burst(1, 2000)
+    observations, rewards = batch.observations[0].numpy(), batch.rewards[0, :, 0].numpy()
+    position, subgoal, left = observations[:, 0], observations[:, 3], observations[:, 4] * RULES.dt_max
+    ahead = np.rint((subgoal - position) / 0.1)  # steps from here to the relabelled subgoal
+    assert set(ahead) <= {1.0, 2.0, 3.0}
+    assert ((position < 0.25) | (ahead <= 2)).all()  # the second window has two steps
+    assert ((position >= 0.25) | (subgoal < 0.35)).all()  # no subgoal from across the window's border
+    assert ((left > ahead - 1) & (left <= ahead)).all()
+    np.testing.assert_array_equal(rewards, ahead == 1)
+    np.testing.assert_array_equal(batch.dones[0, :, 0].numpy(), rewards)
+
+
+def test_plain_low_level_samples_are_what_was_stored() -> None:
+    buffer = low_buffer(100, hindsight=0)
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    batch = buffer.sample_burst(2, 50)
+    assert batch.observations.shape == (2, 50, 5)
+    assert np.round(batch.observations[..., 3].unique().numpy(), 5).tolist() == pytest.approx([0.5, 0.9])
+    assert batch.next_states.min() == 1
+    assert batch.states.max() == 0
+
+
+def test_ring_never_mixes_windows_after_wrapping() -> None:
+    buffer = low_buffer(13, hindsight=1e9)  # 5 rows at a time: windows get cut by the write position
+    for _ in range(7):
+        buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+        batch = buffer.sample_burst(1, 500)
+        position, subgoal = batch.observations[0, :, 0].numpy(), batch.observations[0, :, 3].numpy()
+        untouched = np.isclose(subgoal, 0.9) | (np.isclose(subgoal, 0.5) & (position > 0.25))
+        within = np.where(position < 0.25, subgoal < 0.35, subgoal > 0.35)
+        assert (untouched | within).all()
+    assert buffer.size() == 13
+
+
+def test_option_buffer_gives_sb3_samples_with_discounts() -> None:
+    buffer = OptionReplayBuffer(50, LAYOUT.high_space(ENV.observation_space), LAYOUT.high_action_space(), seed=0)
+    reward = HighLevelReward("smdp", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
+    settings = HindsightSettings(0, "future", -5.0, keep_original=True)
+    buffer.extend(
+        high_level_steps(
+            episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0)
+        )
+    )
+    sample = buffer.sample(64)
+    np.testing.assert_allclose(sample.discounts.unique().numpy(), [0.9**1.5, 0.9], rtol=1e-6)
+    with pytest.raises(TypeError, match="extend"):
+        buffer.add()
+
+
+def test_buffer_state_round_trip_and_mismatch() -> None:
+    buffer, other = low_buffer(13, 3), low_buffer(13, 3)
+    for _ in range(3):
+        buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    other.set_state({k: v.copy() for k, v in buffer.get_state().items()})
+    assert (other.pos, other.full) == (buffer.pos, buffer.full)
+    for name in buffer.data:
+        np.testing.assert_array_equal(other.data[name], buffer.data[name])
+    state = buffer.get_state()
+    state["subgoal"] = np.zeros((13, 7))
+    with pytest.raises(ValueError, match="subgoal has width 1"):
+        other.set_state(state)
+    with pytest.raises(ValueError, match="does not fit"):
+        low_buffer(3, 1).extend(low_level_steps(episode(), ENV.subgoals, RULES))
