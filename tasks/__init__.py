@@ -13,6 +13,7 @@ _CLASSES = {
     "UR5Reacher": "ur5_reacher",
     "AntFourRooms": "ant_four_rooms",
     "Platforms": "platforms",
+    "Tennis2D": "tennis2d",
 }
 TASKS = tuple(_CLASSES)
 """Names of the tasks; the id of each is ``sb3_tbc/<name>-v0``."""

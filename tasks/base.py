@@ -231,7 +231,8 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
 
     def _holds(self, achieved: list[float], desired: list[float]) -> bool:
         """Goal test of one pair in plain Python; agrees with :meth:`_holds_batch` to the bit."""
-        for a, d, tolerance in zip(achieved, desired, self.goal_tolerance):  # noqa: B905 (strict=True takes 0.2 us)
+        # A plain loop, because all() over a generator takes twice as long.
+        for a, d, tolerance in zip(achieved, desired, self.goal_tolerance):  # noqa: B905, SIM110
             if not abs(a - d) <= tolerance:
                 return False
         return True

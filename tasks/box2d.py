@@ -1,7 +1,8 @@
-"""What the Box2D tasks share: the import with a useful message, and the ways bodies are made."""
+"""What the Box2D tasks share: the import with a useful message, and fixtures made once."""
 
 from __future__ import annotations
 
+import functools
 from types import ModuleType
 from typing import Any
 
@@ -19,15 +20,20 @@ def load_box2d() -> ModuleType:
     return module
 
 
-def box_body(world: Any, kind: int, centre: tuple[float, float], size: tuple[float, float], **fixture: Any) -> Any:
-    """Add a body with one rectangle.
+@functools.cache
+def box_fixture(half_width: float, half_height: float, **attributes: float) -> Any:
+    """Definition of a rectangular fixture; cached, because the bindings lose the memory of each definition.
 
-    :param world: the Box2D world
-    :param kind: ``b2_staticBody``, ``b2_kinematicBody`` or ``b2_dynamicBody``
-    :param centre: of the rectangle, metres
-    :param size: full width and height, metres
-    :param fixture: further fixture attributes (density, friction, ...)
+    :param half_width: metres
+    :param half_height: metres
+    :param attributes: ``density``, ``restitution``, ``groupIndex``, ...
     """
     b2 = load_box2d()
-    shape = b2.b2PolygonShape(box=(size[0] / 2, size[1] / 2))
-    return world.CreateBody(type=kind, position=centre, fixtures=b2.b2FixtureDef(shape=shape, **fixture))
+    return b2.b2FixtureDef(shape=b2.b2PolygonShape(box=(half_width, half_height)), **attributes)
+
+
+@functools.cache
+def circle_fixture(radius: float, **attributes: float) -> Any:
+    """Definition of a circular fixture; see :func:`box_fixture`."""
+    b2 = load_box2d()
+    return b2.b2FixtureDef(shape=b2.b2CircleShape(radius=radius), **attributes)

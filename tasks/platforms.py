@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array, GoalTask
-from .box2d import box_body, load_box2d
+from .box2d import box_fixture, circle_fixture, load_box2d
 from .history import FrameHistory
 
 DT = 1.0 / 60.0
@@ -41,8 +41,8 @@ class Platforms(GoalTask):
     platform 1 moves down from level 2 and back once the ball has rolled over the trigger, for pi seconds.
 
     * ``observation``, compact (13): spin / 20, platform 0 (x, y, v_x, v_y), platform 1, ball position, ball velocity.
-      Paper (75): the last 5 frames, oldest first, of these and the trigger: active (-1 or 1), share of its time that has
-      passed (-1 to 1).
+      Paper (75): the last 5 frames, oldest first, of these and the trigger: active (-1 or 1), share of its time
+      that has passed (-1 to 1).
     * Goal (2): ball position; desired (x, 0.45) with x in [-0.6, -0.4], success within 0.05 m; 500 steps.
     * Start: at rest at (-0.8, -0.55), platforms at the beginning of their period; only the goal is random.
     * Subgoals (4): ball position and velocity in [-1, 1]; thresholds 0.05 m and 0.2 m/s, Euclidean.
@@ -84,14 +84,14 @@ class Platforms(GoalTask):
         return np.ones(N_FRAMES * FRAME_DIM if paper else 13), np.ones(2), subgoals
 
     def _build(self) -> None:
-        b2 = self._b2
-        self._world = world = b2.b2World(gravity=(0, -9.8))
-        for centre, size in STATIC:
-            box_body(world, b2.b2_staticBody, centre, size)
-        self._platform0 = box_body(world, b2.b2_kinematicBody, (0, 0), PLATFORM_SIZE)
-        self._platform1 = box_body(world, b2.b2_kinematicBody, (0, 0), PLATFORM_SIZE)
+        self._world = world = self._b2.b2World(gravity=(0, -9.8))
+        for centre, (width, height) in STATIC:
+            world.CreateStaticBody(position=centre, fixtures=box_fixture(width / 2, height / 2))
+        platform = box_fixture(PLATFORM_SIZE[0] / 2, PLATFORM_SIZE[1] / 2)
+        self._platform0 = world.CreateKinematicBody(position=(0, 0), fixtures=platform)
+        self._platform1 = world.CreateKinematicBody(position=(0, 0), fixtures=platform)
         # The order of creation is the order in which contacts are solved, so it matters to the last bit.
-        ball = b2.b2FixtureDef(shape=b2.b2CircleShape(radius=RADIUS), density=1.0, restitution=0.4)
+        ball = circle_fixture(RADIUS, density=1.0, restitution=0.4)
         self._ball = world.CreateDynamicBody(position=(-0.8, -0.55), fixtures=ball)
 
     def _sample_goal(self) -> Sequence[float]:
