@@ -56,14 +56,14 @@ class FrozenNDBC:
         :param state: potentials, ``(batch, state_dim)``, float32; not changed
         :return: outputs ``(batch, n_outputs)`` and the next potentials
         """
-        n = self.state_dim
+        n, presynaptic = self.state_dim, len(self._gain)
         recurrent, gain, threshold, inertia = self._recurrent, self._gain, self._threshold, self._inertia
         excited = inputs.dot(self._excite)
         excited += self._excite_bias
         drive = np.tanh(excited, out=excited).dot(self._from_inputs)
         drive += self._rest
         for _ in range(self._sub_steps):
-            released = state * gain
+            released = state[:, :presynaptic] * gain
             released -= threshold
             total = np.tanh(released, out=released).dot(recurrent)
             total += drive

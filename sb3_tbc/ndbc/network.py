@@ -1,27 +1,37 @@
-"""NDBCNet: a conductance cell, unrolled over sub-steps and time, with a linear readout."""
+"""NDBCNet: a cell on a wiring, unrolled over sub-steps and time, with a linear readout."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch as th
 from torch import nn
 from torch.nn import functional
 
 from sb3_tbc.ndbc.cell import ConductanceCell
+from sb3_tbc.ndbc.dissipative import Certificate, DissipativeCell
+from sb3_tbc.ndbc.sequence import unroll
 from sb3_tbc.ndbc.wiring import NDBCWiring
+
+DYNAMICS = ("conductance", "dissipative")
 
 
 class NDBCNet(nn.Module):
     """Neuro-dynamic bionic control network (paper, section 4.3): sparse, continuous-time, with memory.
 
+    The unit of time is one control step, cut into K sub-steps. Sensory neurons have no state: their potential is the
+    scaled input.
+
     :param n_inputs: number of inputs; each is a sensory neuron
     :param n_outputs: number of outputs ``y = sum_i alpha_i V_i + bias``
-    :param wiring: who is wired to whom
+    :param wiring: who is wired to whom, or its plain data (see :meth:`NDBCWiring.from_dict`)
     :param sub_steps: K, sub-steps per control step; three synaptic hops lie between sensory and motor neurons
+    :param dynamics: ``"conductance"`` or ``"dissipative"`` (equations 20 and 21)
     :param input_scale: fixed scales the inputs are divided by, ``(n_inputs,)``; by default 1
     :param readout: ``"all"`` sums over all neurons, as the paper's equation does, ``"motor"`` over the motor neurons
-    :param seed: seed of the initial values
+    :param max_rho: dissipative only: keep the contraction factor of the certificate below this, during training too
+    :param seed: seed of the initial values; by default torch's global stream
     :raises ValueError: if sizes do not fit together or an option is unknown
     """
 
@@ -29,36 +39,50 @@ class NDBCNet(nn.Module):
         self,
         n_inputs: int,
         n_outputs: int,
-        wiring: NDBCWiring,
+        wiring: NDBCWiring | Mapping[str, Any],
         sub_steps: int = 3,
+        dynamics: str = "conductance",
         input_scale: Sequence[float] | None = None,
         readout: str = "all",
-        seed: int = 0,
+        max_rho: float | None = None,
+        seed: int | None = None,
     ) -> None:
         super().__init__()
-        if n_inputs != wiring.n_inputs:
-            raise ValueError(f"n_inputs={n_inputs}, but the wiring has {wiring.n_inputs} sensory neurons")
-        if sub_steps < 1:
-            raise ValueError(f"sub_steps must be at least 1, got {sub_steps}")
-        if readout not in ("all", "motor"):
-            raise ValueError(f"readout must be 'all' or 'motor', got {readout!r}")
+        wiring = wiring if isinstance(wiring, NDBCWiring) else NDBCWiring.from_dict(wiring)
+        _check_options(n_inputs, n_outputs, wiring, sub_steps, dynamics, readout, max_rho)
         scale = th.ones(n_inputs) if input_scale is None else th.as_tensor(input_scale, dtype=th.float32).clone()
         if scale.shape != (n_inputs,) or not bool((scale > 0).all()):
             raise ValueError(f"input_scale must be {n_inputs} positive numbers, got {input_scale}")
-        generator = th.Generator().manual_seed(seed)
-        self.n_inputs, self.n_outputs, self.sub_steps, self.wiring = n_inputs, n_outputs, sub_steps, wiring
-        self.readout = readout
+        generator = None if seed is None else th.Generator().manual_seed(seed)
+        self.n_inputs, self.n_outputs, self.sub_steps, self.wiring = n_inputs, n_outputs, int(sub_steps), wiring
+        self.dynamics, self.readout = dynamics, readout
         self.input_gain: th.Tensor
         self.register_buffer("input_gain", 1.0 / scale)
-        self.cell = ConductanceCell(wiring, generator)
-        self._read_from = wiring.layer("motor").start if readout == "motor" else 0
-        n_read = wiring.n_neurons - self._read_from
-        self.readout_weight = nn.Parameter((2.0 * th.rand(n_outputs, n_read, generator=generator) - 1.0) * n_read**-0.5)
+        self.cell: ConductanceCell | DissipativeCell = (
+            ConductanceCell(wiring, generator)
+            if dynamics == "conductance"
+            else DissipativeCell(wiring, generator, max_rho=max_rho)
+        )
+        self._check_enforceable(max_rho)
+        self.read_from = wiring.layer("motor").start if readout == "motor" else 0
+        n_read = wiring.n_neurons - self.read_from
+        drawn = 2.0 * th.rand(n_outputs, n_read, generator=generator) - 1.0
+        self.readout_weight = nn.Parameter(drawn / n_read**0.5)
         self.readout_bias = nn.Parameter(th.zeros(n_outputs))
         self._centre(generator)
 
+    def _check_enforceable(self, max_rho: float | None) -> None:
+        if max_rho is None or not isinstance(self.cell, DissipativeCell):
+            return
+        least = 1.0 / (1.0 + self.cell.min_damping / self.sub_steps)
+        if max_rho <= least:
+            raise ValueError(
+                f"max_rho={max_rho} leaves no room for recurrent synapses: with {self.sub_steps} sub-steps and damping of "
+                f"at least {self.cell.min_damping} it must exceed {least:.3f}; use fewer sub-steps or a larger max_rho"
+            )
+
     @th.no_grad()
-    def _centre(self, generator: th.Generator) -> None:
+    def _centre(self, generator: th.Generator | None) -> None:
         """Start with outputs of mean zero over uniform inputs, so that a policy starts unbiased."""
         inputs = (2.0 * th.rand(256, self.n_inputs, generator=generator) - 1.0) / self.input_gain
         self.readout_bias.copy_(-self(inputs)[0].mean(dim=0))
@@ -73,32 +97,97 @@ class NDBCNet(nn.Module):
         return self.readout_bias.new_zeros(batch, self.state_dim)
 
     def forward(
-        self, inputs: th.Tensor, state: th.Tensor | None = None, mask: th.Tensor | None = None
+        self,
+        inputs: th.Tensor,
+        state: th.Tensor | None = None,
+        mask: th.Tensor | None = None,
+        interval: th.Tensor | None = None,
     ) -> tuple[th.Tensor, th.Tensor]:
         """Outputs and the potentials they leave behind.
 
         :param inputs: ``(batch, n_inputs)`` for one step or ``(batch, time, n_inputs)`` for a sequence
         :param state: potentials to start from, ``(batch, state_dim)``; by default zero
         :param mask: 0 where the potentials are reset *before* the step, else 1; ``(batch,)`` or ``(batch, time)``
+        :param interval: length of the step in control steps where it is not 1, ``(batch,)`` or ``(batch, time)``
         :return: outputs ``(batch, n_outputs)`` or ``(batch, time, n_outputs)``, and the final potentials
+        :raises ValueError: if a shape does not fit
         """
-        potentials = self.initial_state(inputs.shape[0]) if state is None else state
-        arrays = self.cell.arrays()
-        inertia = arrays.capacitance * self.sub_steps
-        drive = self.cell.drive(inputs * self.input_gain, arrays)
-        drive = drive + functional.pad(inertia, (self.state_dim, 0))
         if inputs.dim() == 2:
-            potentials = potentials if mask is None else potentials * mask.unsqueeze(-1)
-            for _ in range(self.sub_steps):
-                potentials = self.cell.step(potentials, drive, inertia, arrays)
-            return self._read(potentials), potentials
-        trace = []
-        for t, drive_t in enumerate(drive.unbind(dim=1)):
-            potentials = potentials if mask is None else potentials * mask[:, t].unsqueeze(-1)
-            for _ in range(self.sub_steps):
-                potentials = self.cell.step(potentials, drive_t, inertia, arrays)
-            trace.append(potentials)
-        return self._read(th.stack(trace, dim=1)), potentials
+            state = self._advance(inputs, state, mask, interval)
+            return self.read(state), state
+        trace = self.unroll(inputs, state, mask, interval)
+        return self.read(trace), trace[:, -1]
 
-    def _read(self, potentials: th.Tensor) -> th.Tensor:
-        return functional.linear(potentials[..., self._read_from :], self.readout_weight, self.readout_bias)
+    def read(self, state: th.Tensor) -> th.Tensor:
+        """The readout ``y = sum_i alpha_i V_i + bias`` of potentials ``(..., state_dim)``."""
+        return functional.linear(state[..., self.read_from :], self.readout_weight, self.readout_bias)
+
+    def unroll(
+        self,
+        inputs: th.Tensor,
+        state: th.Tensor | None = None,
+        mask: th.Tensor | None = None,
+        interval: th.Tensor | None = None,
+    ) -> th.Tensor:
+        """Potentials after every step of a sequence, ``(batch, time, state_dim)``; arguments as in :meth:`forward`."""
+        self._check_shapes(inputs, state, mask, interval, dims=3)
+        state = self.initial_state(inputs.shape[0]) if state is None else state
+        if isinstance(self.cell, ConductanceCell) and interval is None:
+            return unroll(self.cell, self.cell.arrays(), inputs * self.input_gain, state, mask, self.sub_steps)
+        trace = []
+        for t in range(inputs.shape[1]):
+            mask_t, interval_t = (None if x is None else x[:, t] for x in (mask, interval))
+            state = self._advance(inputs[:, t], state, mask_t, interval_t)
+            trace.append(state)
+        return th.stack(trace, dim=1)
+
+    def _advance(
+        self, inputs: th.Tensor, state: th.Tensor | None, mask: th.Tensor | None, interval: th.Tensor | None
+    ) -> th.Tensor:
+        """The potentials one control step later; plain tensor operations, so any tracer can follow."""
+        self._check_shapes(inputs, state, mask, interval, dims=2)
+        state = self.initial_state(inputs.shape[0]) if state is None else state
+        state = state if mask is None else state * mask.unsqueeze(-1)
+        cell: Any = self.cell
+        arrays = cell.arrays()
+        pace = cell.pace(arrays, 1.0 / self.sub_steps if interval is None else interval.unsqueeze(-1) / self.sub_steps)
+        drive = cell.drive(inputs * self.input_gain, arrays, pace)
+        for _ in range(self.sub_steps):
+            state = cell.step(state, drive, arrays, pace)
+        return state
+
+    def _check_shapes(
+        self, inputs: th.Tensor, state: th.Tensor | None, mask: th.Tensor | None, interval: th.Tensor | None, dims: int
+    ) -> None:
+        lead = tuple(inputs.shape[:-1])
+        if inputs.dim() != dims or inputs.shape[-1] != self.n_inputs:
+            raise ValueError(f"inputs must be (batch, [time,] {self.n_inputs}), got shape {tuple(inputs.shape)}")
+        if state is not None and tuple(state.shape) != (lead[0], self.state_dim):
+            raise ValueError(f"state must be ({lead[0]}, {self.state_dim}), got shape {tuple(state.shape)}")
+        for name, value in (("mask", mask), ("interval", interval)):
+            if value is not None and tuple(value.shape) != lead:
+                raise ValueError(f"{name} must have one entry per step, shape {lead}, got {tuple(value.shape)}")
+
+    def certificate(self) -> Certificate:
+        """Bounded-input bounded-state certificate of the dissipative dynamics, per sub-step (equation 21).
+
+        :raises ValueError: for conductance dynamics, whose potentials are bounded whatever the weights
+        """
+        if not isinstance(self.cell, DissipativeCell):
+            raise ValueError("conductance dynamics need no certificate: NDBCNet.cell.bounds() holds for any weights")
+        return self.cell.certificate(1.0 / self.sub_steps)
+
+
+def _check_options(
+    n_inputs: int, n_outputs: int, wiring: NDBCWiring, sub_steps: int, dynamics: str, readout: str, max_rho: float | None
+) -> None:
+    if n_inputs != wiring.n_inputs:
+        raise ValueError(f"n_inputs={n_inputs}, but the wiring has {wiring.n_inputs} sensory neurons")
+    if n_outputs < 1 or sub_steps < 1:
+        raise ValueError(f"n_outputs and sub_steps must be at least 1, got {n_outputs} and {sub_steps}")
+    if dynamics not in DYNAMICS:
+        raise ValueError(f"dynamics must be one of {DYNAMICS}, got {dynamics!r}")
+    if readout not in ("all", "motor"):
+        raise ValueError(f"readout must be 'all' or 'motor', got {readout!r}")
+    if max_rho is not None and dynamics != "dissipative":
+        raise ValueError("max_rho belongs to dynamics='dissipative'; conductance dynamics are bounded as they are")
