@@ -57,7 +57,9 @@ class RingBuffer(BaseBuffer):
     def _extend(self, rows: Mapping[str, NDArray[Any]]) -> None:
         count = len(next(iter(rows.values())))
         if count > self.buffer_size:
-            raise ValueError(f"an episode of {count} rows does not fit a buffer of {self.buffer_size}; raise buffer_size")
+            raise ValueError(
+                f"an episode of {count} rows does not fit a buffer of {self.buffer_size}; raise buffer_size"
+            )
         self._reserve(min(self.pos + count, self.buffer_size))
         at = (self.pos + np.arange(count)) % self.buffer_size
         for name, array in self.data.items():

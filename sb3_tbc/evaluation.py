@@ -88,7 +88,9 @@ class _Runner:
         membrane = np.zeros((env.num_envs, state_dim), dtype=np.float32)
         results: list[list[tuple[Any, ...]]] = [[] for _ in range(env.num_envs)]
         while min(len(rows) for rows in results) < per_env:
-            unit, membrane = model.low.act(observation, membrane, self.deterministic, self.rng, average=self.deterministic)
+            unit, membrane = model.low.act(
+                observation, membrane, self.deterministic, self.rng, average=self.deterministic
+            )
             observation, _, window_over, infos = env.step(model.policy._unscale(unit))
             membrane = self._forget(membrane, window_over, infos)
             over = [index for index in range(env.num_envs) if infos[index].get("episode_over")]

@@ -277,7 +277,9 @@ def high_level_steps(
         copies = relabel_goals(episode, starts[pairs[:, 0]], durations[pairs[:, 0]], goals, reward, goal_test)
         rows = pairs[:, 0]
         parts.append(
-            steps(rows, actions[rows], charged(copies.rewards, actions[rows]), copies.dones, copies.durations, True, goals)
+            steps(
+                rows, actions[rows], charged(copies.rewards, actions[rows]), copies.dones, copies.durations, True, goals
+            )
         )
     return HighLevelSteps(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 

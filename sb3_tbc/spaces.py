@@ -46,14 +46,18 @@ class SubgoalSpace:
         self.thresholds = np.asarray(thresholds, dtype=np.float64)
         self.local_scale = np.asarray(local_scale, dtype=np.float64)
         self.names = tuple(names)
-        self.groups = tuple(tuple(g) for g in groups) if groups is not None else tuple((i,) for i in range(len(self.low)))
+        self.groups = (
+            tuple(tuple(g) for g in groups) if groups is not None else tuple((i,) for i in range(len(self.low)))
+        )
         self._achieved = achieved
         self._local = local
         self._check()
 
     def _check(self) -> None:
         if self.low.ndim != 1 or self.low.shape != self.high.shape or not np.all(self.low < self.high):
-            raise ValueError(f"subgoal bounds must be two vectors with low < high, got low={self.low}, high={self.high}")
+            raise ValueError(
+                f"subgoal bounds must be two vectors with low < high, got low={self.low}, high={self.high}"
+            )
         if len(self.names) != self.dim:
             raise ValueError(f"{self.dim} subgoal coordinates need as many names, got {self.names}")
         if self.thresholds.shape != (len(self.groups),) or not np.all(self.thresholds > 0):

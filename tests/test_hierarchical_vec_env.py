@@ -87,9 +87,7 @@ def test_discounted_option_reward_equals_hand_rolled_sum(seed: int, gamma: float
     for episode in episodes:
         starts = np.array([o.start for o in episode.options])
         durations = np.array([o.duration for o in episode.options])
-        by_hand = [
-            sum(gamma**j * episode.rewards[o.start + j] for j in range(o.duration)) for o in episode.options
-        ]
+        by_hand = [sum(gamma**j * episode.rewards[o.start + j] for j in range(o.duration)) for o in episode.options]
         np.testing.assert_allclose(discounted_sums(episode.rewards, starts, durations, gamma), by_hand, atol=1e-9)
 
 

@@ -172,9 +172,7 @@ def test_option_buffer_gives_sb3_samples_with_discounts() -> None:
     reward = HighLevelReward("smdp", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
     settings = HindsightSettings(0, "future", -5.0, keep_original=True)
     buffer.extend(
-        high_level_steps(
-            episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0)
-        )
+        high_level_steps(episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
     )
     sample = buffer.sample(64)
     np.testing.assert_allclose(sample.discounts.unique().numpy(), [0.9**1.5, 0.9], rtol=1e-6)

@@ -121,7 +121,9 @@ class HierarchicalVecEnv(VecEnvWrapper):
         sizes = {key: space.spaces[key].shape[0] for key in GOAL_KEYS}  # type: ignore[index]
         actions = self.action_space.shape
         if not isinstance(self.action_space, spaces.Box) or actions is None or len(actions) != 1:
-            raise ValueError(f"a hierarchical agent needs a Box action space with one dimension, got {self.action_space}")
+            raise ValueError(
+                f"a hierarchical agent needs a Box action space with one dimension, got {self.action_space}"
+            )
         return {
             **sizes,
             "local": self.layout.subgoals.local_dim,
@@ -237,9 +239,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self._begin_options(where, observation)
         return local
 
-    def _finish_episode(
-        self, index: int, observation: dict[str, FloatArray], done: bool, info: dict[str, Any]
-    ) -> None:
+    def _finish_episode(self, index: int, observation: dict[str, FloatArray], done: bool, info: dict[str, Any]) -> None:
         truncated = bool(info.get("TimeLimit.truncated", False)) or not done
         success = bool(info.get("is_success", False)) and done
         episode = self._recorder.finish(index, terminated=not truncated, success=success)
