@@ -183,8 +183,8 @@ STYLE = (
 NOTES = (
     "The seed is the unit: intervals are percentile bootstraps over seeds (10,000 resamples). Length: mean steps of "
     "successful episodes. Subgoals: share of windows that reached theirs. Window: mean executed length in steps. "
-    "To 0.9: steps until an evaluation first succeeds in 0.9 of its episodes. Stable: share of evaluations at 0.9 or more from "
-    "then on. Bands are 95 % bootstrap intervals of the mean curve."
+    "To 0.9: steps until an evaluation first succeeds in 0.9 of its episodes. Stable: share of evaluations at 0.9 "
+    "or more from then on. Bands are 95 % bootstrap intervals of the mean curve."
 )
 
 

@@ -213,7 +213,7 @@ def _learn(model: TBCHRL, spec: RunSpec, folder: RunFolder, options: RunOptions,
             message = f"stopped at {model.num_timesteps} of {spec.run.n_timesteps} steps"
             raise Interrupted(message, folder.path) from error
         save_atomic(model.save, folder.model)
-        result = _final(model, spec, folder, eval_env, evaluations)
+        result = _final(model, spec, folder, evaluations.wall_time)
     finally:
         eval_env.close()
     if options.keep_checkpoint:
@@ -229,12 +229,14 @@ def _train(model: TBCHRL, n_timesteps: int, callback: BaseCallback, progress: bo
     model.learn(n_timesteps - model.num_timesteps, callback=callback, reset_num_timesteps=fresh, progress_bar=progress)
 
 
-def _final(
-    model: TBCHRL, spec: RunSpec, folder: RunFolder, eval_env: VecEnv, evaluations: SuccessEvalCallback
-) -> dict[str, Any]:
-    trained = evaluations.wall_time
+def _final(model: TBCHRL, spec: RunSpec, folder: RunFolder, trained: float) -> dict[str, Any]:
+    """Evaluate the trained agent as ``python -m sb3_tbc.evaluate`` does, on ``eval_seed``."""
     seed = spec.seed + FINAL_SEED
-    result = evaluate_hierarchical(model, eval_env, spec.n_final_episodes, seed=seed, deterministic=True)
+    env = evaluation_envs(spec.env_id, spec.n_final_episodes, seed, spec.run.env_kwargs)
+    try:
+        result = evaluate_hierarchical(model, env, spec.n_final_episodes, seed=seed, deterministic=True)
+    finally:
+        env.close()
     return {
         **spec.identity,
         "n_timesteps": int(model.num_timesteps),

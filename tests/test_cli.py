@@ -1,0 +1,271 @@
+"""The commands, end to end on tiny runs, and their answers to mistakes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from sb3_tbc import __main__, evaluate, report, train
+from sb3_tbc.zoo.ledger import RunFolder
+
+TINY = ["--hyperparams", "compile:false", "gradient_ratio:0.05", "low.batch_size:16", "high.batch_size:4"]
+TINY += ["low.buffer_size:2000", "high.buffer_size:500", "max_options:3"]
+SHORT = ["--eval-freq", "200", "--n-eval-episodes", "1", "--n-final-episodes", "2", "--no-progress"]
+PINNED = ["task", "algo", "variant", "config", "seed", "n_timesteps", "n_episodes", "success_rate", "success_ci95"]
+PINNED += ["mean_length", "mean_length_success", "subgoal_success", "mean_window"]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one small finished run."""
+    folder = tmp_path_factory.mktemp("runs")
+    arguments = ["--env", "Pendulum", "--n-timesteps", "400", "--log-folder", str(folder), "--seed", "5"]
+    assert train.main([*arguments, "--keep-checkpoint", "--trace", *SHORT, *TINY]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(root: Path) -> RunFolder:
+    return RunFolder.of(root, "Pendulum", "tbc-hrl", "full", 5)
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """Standard error, which must be one line without a traceback."""
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1, captured.err
+    assert "Traceback" not in captured.err
+    return captured.err
+
+
+def test_a_run_leaves_everything_behind(run: RunFolder) -> None:
+    names = {p.name for p in run.path.iterdir()}
+    assert {"config.yml", "command.txt", "versions.json", "evaluations.csv", "final.json"} <= names
+    assert {"model.zip", "best_model.zip", "progress.csv", "options.csv", "checkpoint"} <= names
+    final = run.read_final()
+    assert set(PINNED) <= set(final)
+    assert (final["task"], final["algo"], final["variant"], final["config"]) == ("Pendulum", "tbc-hrl", "full", "tuned")
+    assert (final["seed"], final["n_timesteps"], final["n_episodes"]) == (5, 400, 2)
+    assert [row.timesteps for row in run.read_evaluations()] == [200, 400]
+    assert run.read_config()["model"]["low"]["batch_size"] == 16
+    assert (run.path / "command.txt").read_text().startswith("python -m sb3_tbc.train --env Pendulum")
+    assert (run.path / "options.csv").read_text().count("\n") > 3
+
+
+def test_evaluate_prints_what_it_writes(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "e.json"
+    arguments = [str(run.model), "--n-episodes", "2", "--seed", str(run.read_final()["eval_seed"]), "--json", str(out)]
+    assert evaluate.main(arguments) == 0
+    assert capsys.readouterr().out == out.read_text()
+    result = json.loads(out.read_text())
+    assert list(result)[: len(PINNED)] == PINNED
+    final = run.read_final()
+    assert {k: result[k] for k in PINNED} == {k: final[k] for k in PINNED}  # a loaded agent acts as the saved one
+
+
+def test_evaluate_in_a_new_process(run: RunFolder, tmp_path: Path) -> None:
+    out = tmp_path / "e.json"
+    seed = str(run.read_final()["eval_seed"])
+    arguments = [sys.executable, "-m", "sb3_tbc.evaluate", str(run.model), "--n-episodes", "2", "--seed", seed]
+    done = subprocess.run([*arguments, "--json", str(out)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert {k: json.loads(out.read_text())[k] for k in PINNED} == {k: run.read_final()[k] for k in PINNED}
+
+
+def test_a_finished_run_is_not_overwritten(run: RunFolder, root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {p: p.stat().st_mtime_ns for p in run.path.rglob("*")}
+    assert train.main(["--n-timesteps", "200", "--log-folder", str(root), "--seed", "5", *SHORT, *TINY]) == 2
+    assert "holds a finished run; nothing was changed" in said(capsys)
+    assert {p: p.stat().st_mtime_ns for p in run.path.rglob("*")} == before
+
+
+def test_resume_goes_on_and_keeps_the_curve(run: RunFolder, tmp_path: Path) -> None:
+    copy = RunFolder(tmp_path / "seed_5")
+    shutil.copytree(run.path, copy.path)
+    assert train.main(["--resume", str(copy.path), "--n-timesteps", "600", "--no-progress"]) == 0
+    assert [row.timesteps for row in copy.read_evaluations()] == [200, 400, 600]
+    assert copy.read_final()["n_timesteps"] == 600
+    assert copy.read_evaluations()[:2] == run.read_evaluations()
+    assert copy.read_evaluations()[2].wall_time > run.read_evaluations()[1].wall_time
+    assert not copy.checkpoint.exists()
+
+
+def test_resume_without_a_checkpoint(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert train.main(["--resume", str(tmp_path)]) == 2
+    assert "holds no run" in said(capsys)
+    copy = RunFolder(tmp_path / "seed_5")
+    shutil.copytree(run.path, copy.path)
+    assert train.main(["--resume", str(copy.path)]) == 2
+    assert "is at 400 of 400 steps; raise --n-timesteps" in said(capsys)
+    shutil.rmtree(copy.checkpoint)
+    assert train.main(["--resume", str(copy.path), "--n-timesteps", "600"]) == 2
+    assert "has no checkpoint" in said(capsys)
+
+
+def test_ctrl_c_saves_and_resume_finishes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from sb3_tbc.callbacks import SuccessEvalCallback
+
+    original = SuccessEvalCallback._on_step
+
+    def interrupt(self: SuccessEvalCallback) -> bool:
+        if self.num_timesteps == 150:
+            raise KeyboardInterrupt
+        return original(self)
+
+    monkeypatch.setattr(SuccessEvalCallback, "_on_step", interrupt)
+    arguments = ["--algo", "hits", "--config", "paper", "--n-timesteps", "300", "--log-folder", str(tmp_path)]
+    assert train.main([*arguments, *SHORT, *TINY]) == 130
+    folder = RunFolder.of(tmp_path, "Pendulum", "hits", "full-paper", 0)
+    assert f"--resume {folder.path}" in capsys.readouterr().err
+    assert not folder.finished
+    monkeypatch.setattr(SuccessEvalCallback, "_on_step", original)
+    assert train.main([*arguments, *SHORT, *TINY]) == 2
+    assert f"or --resume {folder.path}" in said(capsys)
+    ledger = tmp_path / "results"
+    assert train.main(["--resume", str(folder.path), "--no-progress", "--ledger", str(ledger)]) == 0
+    assert folder.read_final()["n_timesteps"] == 300
+    assert RunFolder.of(ledger, "Pendulum", "hits", "full-paper", 0).finished
+
+
+def test_report(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = tmp_path / "report.html"
+    assert report.main([str(root), "--html", str(page)]) == 0
+    assert "| Pendulum | tbc-hrl | 1" in capsys.readouterr().out
+    assert page.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
+    assert "data:image/png;base64," in page.read_text()
+    assert report.main([str(tmp_path)]) == 2
+    assert "no finished runs" in said(capsys)
+
+
+def fake_run(root: Path, task: str, algo: str, seed: int, rate: float) -> None:
+    folder = RunFolder.of(root, task, algo, "full", seed)
+    folder.start({}, "x")
+    identity = {"task": task, "algo": algo, "variant": "full", "seed": seed, "success_rate": rate}
+    rest = {"mean_length_success": 10.0, "subgoal_success": 0.5, "mean_window": 4.0, "stable_share": 1.0}
+    lines = ["timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,wall_time"]
+    lines += [f"{1000 * i},{rate * i / 4},10,10,0.5,4,{i}" for i in range(1, 5)]
+    folder.evaluations.write_text("\n".join(lines) + "\n")
+    folder.finish({**identity, **rest})
+
+
+def test_report_compares_with_the_strongest_baseline(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for seed, noise in enumerate((0.0, 0.01, 0.02)):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.95 + noise)
+        fake_run(tmp_path, "A", "hits", seed, 0.80 + noise)
+        fake_run(tmp_path, "A", "hac", seed, 0.30 + noise)
+    assert report.main([str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    (line,) = [line for line in text.splitlines() if line.startswith("| A ") and "+0.150" in line]
+    cells = [cell.strip() for cell in line.split("|")]
+    assert cells[3] == "+0.150"
+    assert cells[6:8] == ["**", "+1.00"]
+    assert int(cells[8].replace(",", "")) > 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--env", "Pendulm"], "unknown environment 'Pendulm'; did you mean 'Pendulum'?"),
+        (["--env", "sb3_tbc/UR5reacher-v0"], "did you mean 'sb3_tbc/UR5Reacher-v0'?"),
+        (["--env", "no_such_module:Env-v0"], "cannot import module 'no_such_module'"),
+        (["--env", "Pendulum-v1"], "is not a goal environment: its observation has no observation"),
+        (["--algo", "hit"], "unknown algorithm 'hit'; did you mean 'hits'?"),
+        (["--hyperparams", "low.learningrate:1"], "did you mean 'learning_rate'?"),
+        (["--hyperparams", "env_kwargs:{observation: compct}"], "observation must be one of"),
+        (["--hyperparams", "random_fraction:2"], "random_fraction must lie in [0, 1], got 2"),
+        (["--ablation", "no-tz"], "no ablation 'no-tz'"),
+        (["--config-file", "nowhere.yml"], "cannot read configuration nowhere.yml"),
+    ],
+)
+def test_mistakes_cost_one_line_and_write_nothing(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert train.main([*arguments, "--log-folder", str(tmp_path), "--no-progress"]) == 2
+    assert message in said(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("arguments", [["--n-timesteps", "0"], ["--n-timesteps", "1.5"], ["--nonsense"]])
+def test_bad_arguments(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        train.main(arguments)
+    assert stop.value.code == 2
+    assert said(capsys).startswith("sb3_tbc.train: error: ")
+
+
+def test_an_action_space_that_is_no_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import gymnasium as gym
+    from gymnasium import spaces
+
+    class Switch(gym.Env[Any, Any]):
+        observation_space = spaces.Dict(
+            {k: spaces.Box(-1, 1, (1,)) for k in ("observation", "achieved_goal", "desired_goal")}
+        )
+        action_space = spaces.Discrete(2)
+
+    if "SwitchGoal-v0" not in gym.registry:
+        gym.register("SwitchGoal-v0", Switch, disable_env_checker=True)
+    assert train.main(["--env", "SwitchGoal-v0", "--log-folder", str(tmp_path)]) == 2
+    assert "only a Box (continuous actions) is supported" in said(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_zips_that_are_none_of_ours(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from stable_baselines3 import SAC
+
+    truncated, foreign = tmp_path / "cut.zip", tmp_path / "sac.zip"
+    whole = run.model.read_bytes()
+    truncated.write_bytes(whole[: len(whole) // 2])
+    SAC("MlpPolicy", "Pendulum-v1", buffer_size=1, policy_kwargs={"net_arch": [2]}).save(foreign)
+    capsys.readouterr()
+    for path, message in [
+        (tmp_path / "missing.zip", "no such file"),
+        (truncated, "is not a complete agent .zip"),
+        (foreign, "holds an agent of another algorithm (stable_baselines3.sac.policies)"),
+    ]:
+        assert evaluate.main([str(path)]) == 2
+        assert message in said(capsys)
+    assert evaluate.main([str(run.model), "--env", "UR5Reacher", "--n-episodes", "1"]) == 2
+    assert "do not match" in said(capsys)
+
+
+def test_a_flipped_byte_is_noticed(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    damaged = tmp_path / "damaged.zip"
+    content = bytearray(run.model.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    damaged.write_bytes(bytes(content))
+    assert evaluate.main([str(damaged)]) == 2
+    assert "damaged.zip" in said(capsys)
+
+
+def test_console_script(capsys: pytest.CaptureFixture[str]) -> None:
+    assert __main__.main(["--help"]) == 0
+    assert "evaluate" in capsys.readouterr().out
+    assert __main__.main(["evalute"]) == 2
+    assert "did you mean 'evaluate'?" in said(capsys)
+    assert __main__.main(["train", "--env", "Pendulm"]) == 2
+    assert "did you mean 'Pendulum'?" in said(capsys)
+
+
+def test_exit_status_of_the_process() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "sb3_tbc", "train", "--env", "Pendulm"], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+
+
+def test_config_of_a_run_builds_the_same_run(run: RunFolder) -> None:
+    from sb3_tbc.zoo.runner import RunSpec
+
+    data = yaml.safe_load((run.path / "config.yml").read_text())
+    assert RunSpec.from_dict(data).to_dict() == data
