@@ -1,4 +1,4 @@
-"""Errors that name what went wrong inside a hierarchy; user mistakes elsewhere are plain ``ValueError``/``TypeError``."""
+"""Errors that name what went wrong inside a hierarchy; other user mistakes are ``ValueError`` or ``TypeError``."""
 
 
 class HierarchyError(RuntimeError):
@@ -10,4 +10,4 @@ class NonFiniteError(FloatingPointError):
 
 
 class ConfigError(ValueError):
-    """A configuration names something that does not exist or has the wrong type; the message names the nearest match."""
+    """A configuration names what does not exist or has the wrong type; the message names the nearest match."""

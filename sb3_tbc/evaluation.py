@@ -91,7 +91,8 @@ class _Runner:
             unit, membrane = model.low.act(
                 observation, membrane, self.deterministic, self.rng, average=self.deterministic
             )
-            observation, _, window_over, infos = env.step(model.policy._unscale(unit))
+            seen, _, window_over, infos = env.step(model.policy._unscale(unit))
+            observation = np.asarray(seen)
             membrane = self._forget(membrane, window_over, infos)
             over = [index for index in range(env.num_envs) if infos[index].get("episode_over")]
             for index, episode in zip(over, env.episodes, strict=True):

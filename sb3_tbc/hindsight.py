@@ -312,7 +312,7 @@ def relabel_goals(
     last = offsets + durations - 1
     if reward.target == "decision":
         return RelabelledGoals(reward.of(step_rewards, offsets, durations), met[last], durations)
-    met_before = np.cumsum(met) - met
+    met_before: NDArray[np.int64] = np.cumsum(met) - met
     over = met_before - np.repeat(met_before[offsets], durations) > 0
     rewards = reward.of(np.where(over, 0.0, step_rewards), offsets, durations)
     dones = np.logical_or.reduceat(met, offsets)

@@ -1,4 +1,4 @@
-"""Options as data: the rules a window runs by, the live option of each environment, and finished episodes. NumPy only."""
+"""Options as data: the rules of a window, the live option of each environment, finished episodes. NumPy only."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ class OptionRules:
 
     def unit_budget(self, steps: FloatArray) -> FloatArray:
         """Unit action coordinate of a time budget, clipped to [-1, 1]."""
-        return np.clip(2.0 * (steps - self.dt_min) / (self.dt_max - self.dt_min) - 1.0, -1.0, 1.0)
+        return np.asarray(np.clip(2.0 * (steps - self.dt_min) / (self.dt_max - self.dt_min) - 1.0, -1.0, 1.0))
 
     def remaining(self, steps: FloatArray) -> FloatArray:
         """Remaining time as the low level sees it: ``clip(dt_rem / dt_max, 0, 1)`` (paper section 4.1)."""
-        return np.clip(steps / self.dt_max, 0.0, 1.0)
+        return np.asarray(np.clip(steps / self.dt_max, 0.0, 1.0))
 
 
 class Option(NamedTuple):

@@ -84,7 +84,7 @@ class SubgoalSpace:
         return self._local(observation)
 
     def reached(self, achieved: FloatArray, subgoal: FloatArray) -> NDArray[np.bool_]:
-        """Whether ``achieved`` lies within the thresholds of ``subgoal`` (strictly, as HiTS and HAC test), ``(...)``."""
+        """Whether ``achieved`` lies within the thresholds of ``subgoal`` (strictly, as in HiTS), ``(...)``."""
         difference = achieved - subgoal
         if len(self.groups) == self.dim:
             return np.asarray((np.abs(difference) < self.thresholds).all(axis=-1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ class EpisodeDiagnostics:
     def add(self, episode: Episode, steps: HighLevelSteps) -> None:
         """Take in a finished episode and the transitions made of it."""
         options = episode.options
-        values = {
+        values: dict[str, Any] = {
             "option/subgoal_success": np.mean([option.reached for option in options]),
             "option/time_budget": np.mean([option.time_budget for option in options]),
             "option/duration": np.mean([option.duration for option in options]),

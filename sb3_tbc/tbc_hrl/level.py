@@ -148,6 +148,10 @@ class SACLevel(SAC):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_update", "_frozen"]
 
+    def attach(self, replay_buffer: BurstBuffer) -> None:
+        """Learn from this replay buffer from now on."""
+        self.replay_buffer = replay_buffer  # type: ignore[assignment]
+
     @property
     def state_dim(self) -> int:
         """Width of the actor's state, 0 for an MLP."""

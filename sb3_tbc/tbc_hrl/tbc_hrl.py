@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import io
 import os
 import pathlib
@@ -34,31 +33,11 @@ from sb3_tbc.spaces import FloatArray, SubgoalSpace
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.tbc_hrl.policies import LevelPolicy
+from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, attribute_of, level_settings
 from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
 from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, LevelLayout, Proposal, check_goal_space
 
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
-
-LEVEL_DEFAULTS: dict[str, Any] = {
-    "learning_rate": 1e-3,
-    "batch_size": 256,
-    "gamma": 0.98,
-    "tau": 0.01,
-    "ent_coef": "auto",
-    "target_entropy": "auto",
-    "buffer_size": 1_000_000,
-    "policy_kwargs": {"net_arch": [64, 64], "mean_bound": 3.0, "log_std_bounds": [-6.9, 1.8]},
-}
-"""What a level uses where the user says nothing; the head's bounds are HiTS's (sigma in [1e-3, 6])."""
-
-DEFAULT_WIRING = {
-    "inter": 8,
-    "command": 6,
-    "sensory_fanout": 4,
-    "inter_fanout": 5,
-    "recurrent_command_synapses": 3,
-    "motor_fanin": 5,
-}
 
 
 class Replay(NamedTuple):
@@ -74,7 +53,7 @@ class TBCHRL(BaseAlgorithm):
     :param policy: ``"MultiInputPolicy"``
     :param env: a goal environment or its id; its ``subgoals`` attribute says what the high level may ask for
     :param high: settings of the high level under SB3's names (``learning_rate, batch_size, gamma, tau, ent_coef,
-        target_entropy, buffer_size, policy_kwargs``); ``gamma`` is per decision
+        target_entropy, ent_coef_learning_rate, buffer_size, policy_kwargs``); ``gamma`` is per decision
     :param low: settings of the low level, likewise; ``policy_kwargs["ndbc"]`` holds the circuit's wiring, None for an
         MLP actor; ``n_hindsight_goals`` may differ from the high level's
     :param max_options: high-level decisions allowed per episode
@@ -188,11 +167,22 @@ class TBCHRL(BaseAlgorithm):
         )  # fmt: skip
         seeds = np.random.SeedSequence(self.seed).generate_state(6).tolist()
         self.rng = np.random.default_rng(seeds[0])
-        self.high = self._make_level("high", self.high_settings, self.layout.high_space(space),
-                                     self.layout.high_action_space(), seeds[1])  # fmt: skip
-        unit_actions = spaces.Box(-1.0, 1.0, actions.shape, np.float32)
-        self.low = self._make_level("low", self.low_settings, self.layout.low_space(), unit_actions, seeds[2])
-        self._make_buffers(seeds[3], seeds[4])
+        high_spaces = self.layout.high_space(space), self.layout.high_action_space()
+        low_spaces = self.layout.low_space(), spaces.Box(-1.0, 1.0, actions.shape, np.float32)
+        self.high = self._make_level("high", self.high_settings, *high_spaces, seed=seeds[1])
+        self.low = self._make_level("low", self.low_settings, *low_spaces, seed=seeds[2])
+        high_buffer = OptionReplayBuffer(
+            self.high_settings["buffer_size"], *high_spaces, device=self.device, seed=seeds[3]
+        )
+        low_buffer = SubgoalReplayBuffer(
+            self.low_settings["buffer_size"], *low_spaces, subgoals=self.subgoals, rules=self.rules,
+            state_dim=self.low.state_dim, gamma=self.low_settings["gamma"],
+            n_hindsight_goals=self.low_settings.get("n_hindsight_goals", self.n_hindsight_goals),
+            device=self.device, seed=seeds[4],
+        )  # fmt: skip
+        self.replay_buffer = Replay(high_buffer, low_buffer)
+        self.high.attach(high_buffer)
+        self.low.attach(low_buffer)
         self.policy = TBCPolicy(space, actions, self.high, self.low, self.layout, self.rules, self.memory, seeds[5])
         self.diagnostics = EpisodeDiagnostics()
         self.hierarchical_env: HierarchicalVecEnv | None = None
@@ -234,9 +224,8 @@ class TBCHRL(BaseAlgorithm):
         level = SACLevel(
             LevelPolicy, observation, action, None, settings["learning_rate"], gamma, settings["tau"],
             settings["ent_coef"], settings["target_entropy"], policy_kwargs, seed=seed, device=self.device,
-            compile=self.compile,
+            compile=self.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"], name=name,
         )  # fmt: skip
-        level.log_prefix = f"{name}/"
         return level
 
     def _circuit(self, policy_kwargs: dict[str, Any], action_dim: int) -> dict[str, Any] | None:
@@ -248,22 +237,6 @@ class TBCHRL(BaseAlgorithm):
         subgoals = self.layout.subgoals
         scale = np.concatenate([subgoals.local_scale, np.maximum(np.abs(subgoals.low), np.abs(subgoals.high)), [1.0]])
         return {"input_scale": scale.tolist(), **circuit}
-
-    def _make_buffers(self, high_seed: int, low_seed: int) -> None:
-        self.high.replay_buffer = OptionReplayBuffer(
-            self.high_settings["buffer_size"], self.high.observation_space, self.high.action_space,  # type: ignore[arg-type]
-            self.device, high_seed,
-        )  # fmt: skip
-        self.low.replay_buffer = SubgoalReplayBuffer(
-            self.low_settings["buffer_size"], self.low.observation_space, self.low.action_space,  # type: ignore[arg-type]
-            self.layout.subgoals, self.rules, self.low.policy.actor.state_dim, self.low_settings["gamma"],
-            self.low_settings.get("n_hindsight_goals", self.n_hindsight_goals), self.device, low_seed,
-        )  # fmt: skip
-
-    @property
-    def replay_buffer(self) -> Replay:
-        """The replay buffers of both levels."""
-        return Replay(self.high.replay_buffer, self.low.replay_buffer)  # type: ignore[arg-type]
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Train on another environment with the same spaces; the unfinished episode is dropped."""
@@ -291,11 +264,9 @@ class TBCHRL(BaseAlgorithm):
             self._updated_at = 0
         for level in (self.high, self.low):
             level.set_logger(self.logger)
-        self.hierarchical_env = HierarchicalVecEnv(
-            self.env, self._propose, self.layout, self.rules, self.low.policy.actor.state_dim
-        )
+        self.hierarchical_env = HierarchicalVecEnv(self.env, self._propose, self.layout, self.rules, self.low.state_dim)
         self._low_observation = self.hierarchical_env.reset()
-        self._membrane = np.zeros((self.n_envs, self.low.policy.actor.state_dim), dtype=np.float32)
+        self._membrane = np.zeros((self.n_envs, self.low.state_dim), dtype=np.float32)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             if not self.collect_rollouts(callback, total_timesteps):
@@ -313,7 +284,8 @@ class TBCHRL(BaseAlgorithm):
         callback.on_rollout_start()
         while not env.episodes and self.num_timesteps < total_timesteps:
             unit = self._act()
-            self._low_observation, _, window_over, infos = env.step(self.policy._unscale(unit))
+            observation, _, window_over, infos = env.step(self.policy._unscale(unit))
+            self._low_observation = np.asarray(observation)
             self._forget(window_over, infos)
             self.num_timesteps += self.n_envs
             self._update_info_buffer(list(infos), np.array(["episode_over" in info for info in infos]))
@@ -398,9 +370,9 @@ class TBCHRL(BaseAlgorithm):
         updates = int(self.gradient_ratio * steps)
         if self.num_timesteps <= self.learning_starts or updates < 1:
             return
-        for level, settings in ((self.high, self.high_settings), (self.low, self.low_settings)):
-            buffer = level.replay_buffer
-            if buffer is not None and buffer.size() >= settings["batch_size"]:
+        levels = zip((self.high, self.low), self.replay_buffer, (self.high_settings, self.low_settings), strict=True)
+        for level, buffer, settings in levels:
+            if buffer.size() >= settings["batch_size"]:
                 level._current_progress_remaining = self._current_progress_remaining
                 level.train(updates, settings["batch_size"])
         self._n_updates += updates
@@ -428,7 +400,7 @@ class TBCHRL(BaseAlgorithm):
         return [
             *super()._excluded_save_params(),
             "high", "low", "hierarchical_env", "rng", "layout", "rules", "high_reward", "diagnostics",
-            "_low_observation", "_membrane",
+            "_low_observation", "_membrane", "replay_buffer",
         ]  # fmt: skip
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -452,10 +424,10 @@ class TBCHRL(BaseAlgorithm):
             for name in ("high", "low")
             for key, array in getattr(self.replay_buffer, name).get_state().items()
         }
-        if isinstance(path, io.IOBase):
+        if not isinstance(path, (str, pathlib.Path)):
             np.savez(path, **arrays)
             return
-        target = pathlib.Path(path)  # type: ignore[arg-type]
+        target = pathlib.Path(path)
         partial = target.with_name(target.name + ".partial")
         with open(partial, "wb") as file:
             np.savez(file, **arrays)
@@ -467,7 +439,7 @@ class TBCHRL(BaseAlgorithm):
         :param truncate_last_traj: for SB3's sake; unfinished episodes are never in the buffers
         :raises ValueError: if the file was written for other spaces or sizes
         """
-        with np.load(path, allow_pickle=False) as arrays:  # type: ignore[arg-type]
+        with np.load(path, allow_pickle=False) as arrays:
             for name in ("high", "low"):
                 state = {
                     key.removeprefix(f"{name}."): arrays[key] for key in arrays.files if key.startswith(f"{name}.")
@@ -484,29 +456,3 @@ class HiTS(TBCHRL):
     default_window_end: ClassVar[str] = "timed"
     default_target: ClassVar[str] = "decision"
     default_circuit: ClassVar[bool] = False
-
-
-def attribute_of(env: VecEnv, name: str) -> Any:
-    """Attribute of the first task under its wrappers; None where there is none."""
-    try:
-        return env.get_attr(name, indices=[0])[0]
-    except AttributeError:
-        return None
-
-
-def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A level's settings with defaults filled in.
-
-    :raises ValueError: on an unknown name, naming the nearest valid one
-    """
-    given = dict(given or {})
-    allowed = [*LEVEL_DEFAULTS, *extra]
-    for key in given:
-        if key not in allowed:
-            near = difflib.get_close_matches(key, allowed, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"unknown setting {name}.{key}{hint} Allowed: {', '.join(sorted(allowed))}")
-    kwargs = {**LEVEL_DEFAULTS["policy_kwargs"], **given.get("policy_kwargs", {})}
-    if name == "high":
-        kwargs.setdefault("negative_critic", True)
-    return {**LEVEL_DEFAULTS, **given, "policy_kwargs": kwargs}

@@ -48,6 +48,11 @@ def check_goal_space(space: spaces.Space[Any]) -> spaces.Dict:
     return space
 
 
+def width(space: spaces.Dict, key: str) -> int:
+    """Number of entries of a part of a goal observation."""
+    return int(np.prod(space.spaces[key].shape or ()))
+
+
 class LevelLayout(NamedTuple):
     """How the flat observation vectors of both levels are put together."""
 
@@ -68,7 +73,7 @@ class LevelLayout(NamedTuple):
     def high_space(self, space: spaces.Dict) -> spaces.Box:
         """Observation space of the high level."""
         keys = ["desired_goal", "observation"] + ([] if self.achieved_in_observation else ["achieved_goal"])
-        size = sum(space.spaces[key].shape[0] for key in keys)  # type: ignore[index]
+        size = sum(width(space, key) for key in keys)
         return spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
     def low_space(self) -> spaces.Box:
@@ -118,7 +123,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self._started = False
 
     def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
-        sizes = {key: space.spaces[key].shape[0] for key in GOAL_KEYS}  # type: ignore[index]
+        sizes = {key: width(space, key) for key in GOAL_KEYS}
         actions = self.action_space.shape
         if not isinstance(self.action_space, spaces.Box) or actions is None or len(actions) != 1:
             raise ValueError(
@@ -132,7 +137,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
             "next_states": state_dim,
         }
 
-    def reset(self) -> FloatArray:  # type: ignore[override]
+    def reset(self) -> FloatArray:
         """Reset every environment and ask for its first option."""
         observation: GoalObservation = self.venv.reset()  # type: ignore[assignment]
         local = self.layout.subgoals.local(observation)
