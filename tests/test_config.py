@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import inspect
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+from sb3_tbc import TBCHRL
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.tbc_hrl.settings import LEVEL_DEFAULTS
+from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import RunConfig, config_file, load_config, merge, parse_overrides, read_file
+from sb3_tbc.zoo.environments import make_envs, task_names
+from sb3_tbc.zoo.schema import LEVEL, MODEL
 
 TABLES = yaml.safe_load((Path(__file__).parent / "data" / "paper_tables.yaml").read_text())
 TASKS = sorted(TABLES["table_1_environments"])
+WINDOW_CAPS = {  # episode length / action budget, as in the public HiTS files
+    "AntFourRooms": 31.8182,
+    "Drawbridge": 200.0,
+    "Pendulum": 45.4545,
+    "Platforms": 50.0,
+    "Tennis2D": 62.5,
+    "UR5Reacher": 25.0,
+}
 COLUMN = {"tbc-hrl": "TBC-HRL", "hits": "HiTS"}
 
 
@@ -144,3 +158,28 @@ def test_a_run_configuration_survives_yaml() -> None:
 @pytest.mark.parametrize("algo", sorted(COLUMN))
 def test_every_shipped_section_is_a_task(algo: str) -> None:
     assert set(read_file(config_file(algo))) == {"default", *TASKS}
+
+
+def test_the_schema_is_what_the_agent_takes() -> None:
+    taken = set(inspect.signature(TBCHRL).parameters)
+    given_by_the_runner = {"env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size"}
+    assert set(MODEL) == taken - given_by_the_runner - {"subgoals", "_init_setup_model"}
+    assert set(LEVEL) == {*LEVEL_DEFAULTS, "n_hindsight_goals"}
+
+
+@pytest.mark.parametrize("config", ["paper", "tuned"])
+@pytest.mark.parametrize("algo", sorted(COLUMN))
+@pytest.mark.parametrize("task", sorted(task_names()))
+def test_every_shipped_section_builds(task: str, algo: str, config: str) -> None:
+    small = parse_overrides(["low.buffer_size:1000", "high.buffer_size:1000", "compile:false"])
+    run = load_config(algo, task, config, small)
+    env = make_envs(task_names()[task], 1, 0, run.env_kwargs)
+    try:
+        model = build_model(run, env, seed=0)
+    finally:
+        env.close()
+    circuit = run.model["low"]["policy_kwargs"].get("ndbc")
+    state_dim = model.low.policy.actor.state_dim
+    assert state_dim == (0 if circuit is None else circuit["inter"] + circuit["command"] + circuit["motor"])
+    assert model.rules.window_end == run.model["window_end"]
+    assert model.rules.dt_max == pytest.approx(WINDOW_CAPS[task], abs=1e-3)

@@ -30,6 +30,7 @@ POLICY: Schema = {
 }
 LEVEL: Schema = {
     "learning_rate": NUMBER,
+    "ent_coef_learning_rate": NUMBER,
     "batch_size": int,
     "gamma": NUMBER,
     "tau": NUMBER,

@@ -1,0 +1,96 @@
+"""Videos of an agent at work, with the live subgoal and the remaining time drawn in. Needs the ``video`` extra."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.two_level_policy import TwoLevelState
+
+Frame = NDArray[np.uint8]
+
+
+def episode_frames(model: TBCHRL, env: gym.Env[Any, Any], seed: int | None = None) -> Iterator[Frame]:
+    """Frames of one deterministic episode, one per step and one at the end, each ``(height, width, 3)``.
+
+    The episode ends as in an evaluation: success, time limit, or the high level's action budget used up.
+
+    :param model: a trained agent
+    :param env: a task with ``render_mode="rgb_array"``
+    :param seed: of the reset
+    """
+    observation, _ = env.reset(seed=seed)
+    state, start, over, result = None, np.array([True]), False, "time limit"
+    overlay = getattr(env.unwrapped, "set_overlay", None)
+    step = 0
+    while not over:
+        action, carried = model.predict(observation, state, start, deterministic=True)
+        live = TwoLevelState(*carried) if carried is not None else model.policy.initial_state(1)
+        if live.used[0] > model.max_options:
+            result = "action budget used up"
+            break
+        if overlay is not None:
+            left = model.rules.remaining(live.time_budget - live.elapsed + 1)
+            overlay(live.subgoal[0], float(left[0]), f"step {step}, option {live.used[0]} of {model.max_options}")
+        yield _frame(env)
+        observation, _, terminated, truncated, info = env.step(action)
+        state, start, step = carried, np.array([False]), step + 1
+        over = terminated or truncated
+        result = "success" if info.get("is_success") else result
+    if overlay is not None:
+        overlay(text=f"step {step}: {result}")
+    yield _frame(env)
+
+
+def _frame(env: gym.Env[Any, Any]) -> Frame:
+    picture = np.asarray(env.render())
+    height, width = picture.shape[:2]
+    return picture[: height - height % 2, : width - width % 2]  # the codec wants even sizes
+
+
+def record_video(
+    model: TBCHRL,
+    env_id: str,
+    path: Path,
+    n_episodes: int = 3,
+    seed: int = 0,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> None:
+    """Record deterministic episodes to an mp4 file, which appears only when it is complete.
+
+    :param model: a trained agent
+    :param env_id: a registered task that can render
+    :param path: the file, ending in ``.mp4``
+    :param n_episodes: how many
+    :param seed: episode ``i`` starts from ``seed + i``
+    :param env_kwargs: for ``gymnasium.make``
+    :raises ConfigError: if the file's name, the installation or the task do not allow it
+    """
+    if path.suffix != ".mp4":
+        raise ConfigError(f"a video's name must end in .mp4, got {path}")
+    try:
+        import imageio.v2 as imageio
+    except ImportError as error:
+        raise ConfigError("videos need imageio: pip install 'sb3_tbc[video]'") from error
+    env = gym.make(env_id, render_mode="rgb_array", **(env_kwargs or {}))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
+    fps = env.metadata.get("render_fps", 30)
+    try:
+        writer: Any
+        with imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
+            for episode in range(n_episodes):
+                for frame in episode_frames(model, env, seed + episode):
+                    writer.append_data(frame)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+        env.close()
