@@ -37,7 +37,10 @@ def test_sequence_equals_steps_and_resets_equal_fresh_runs() -> None:
 def test_frozen_equals_torch() -> None:
     net = small_net(input_scale=[1.0, 2.0, 8.0, 1.0, 1.0, 0.5])
     frozen = FrozenNDBC(net)
-    inputs, state = np.random.default_rng(0).normal(size=(2, 3, 6)).astype(np.float32), np.zeros((3, net.state_dim), np.float32)
+    inputs, state = (
+        np.random.default_rng(0).normal(size=(2, 3, 6)).astype(np.float32),
+        np.zeros((3, net.state_dim), np.float32),
+    )
     torch_state = th.from_numpy(state)
     for x in inputs:
         output, state = frozen(x, state)

@@ -59,10 +59,10 @@ def uniform(size: int, low: float, high: float, generator: th.Generator | None) 
 class ConductanceCell(nn.Module):
     """Membrane potentials ``C dV/dt = g_l (V_leak - V) + sum_j w_ij sigma(V_j) (E_ij - V) + g_in (tanh(W u + b) - V)``.
 
-    Conductances, capacitances, gains and the size of reversal potentials are softplus of free parameters, one per synapse
-    or neuron: what the wiring leaves out has no parameter at all, so its weight and gradient are exactly zero. The sign
-    the paper gives to w lives in the reversal potential: excitatory E > 0, inhibitory E < 0 (paper, section 4.3). The
-    logistic of neuron j is ``sigma(V_j) = 1 / (1 + exp(threshold_j - gain_j V_j))``; the unit of time is one control step.
+    Conductances, capacitances, gains and the size of reversal potentials are softplus of free parameters, one per
+    synapse or neuron: what the wiring leaves out has no parameter at all, so its weight and gradient are exactly zero.
+    The sign the paper gives to w lives in the reversal potential: excitatory E > 0, inhibitory E < 0 (section 4.3). The
+    logistic of neuron j is ``sigma(V_j) = 1 / (1 + exp(threshold_j - gain_j V_j))``; time in control steps.
 
     :param wiring: who is wired to whom, with polarities
     :param generator: source of the initial values; torch's global one if None
@@ -111,9 +111,14 @@ class ConductanceCell(nn.Module):
 
     def values(self) -> ConductanceValues:
         """The positive quantities from the current free parameters; differentiable."""
-        raw = (self.raw_conductance, self.raw_reversal, self.raw_input_conductance, self.raw_capacitance)
-        raw += (self.raw_leak, self.raw_gain, self.raw_sensory_gain)
-        return ConductanceValues(*functional.softplus(th.cat(raw)).split([len(r) for r in raw]))
+        raw: list[th.Tensor] = [
+            self.raw_conductance,
+            self.raw_reversal,
+            self.raw_input_conductance,
+            self.raw_capacitance,
+        ]
+        raw += [self.raw_leak, self.raw_gain, self.raw_sensory_gain]
+        return ConductanceValues(*th.split(functional.softplus(th.cat(raw)), [len(r) for r in raw]))
 
     def arrays(self) -> ConductanceArrays:
         """Masked conductances from the current free parameters; differentiable."""
@@ -121,9 +126,9 @@ class ConductanceCell(nn.Module):
         value = self.values()
         entries = (value.conductance * value.reversal * self.polarity, value.conductance, value.input_conductance)
         zeros = self.raw_leak.new_zeros
-        rows = (inputs + m, self.n_presynaptic)
+        rows = [inputs + m, self.n_presynaptic]
         flat = zeros(sum(rows) * 2 * n).scatter(0, self.matrix_index, th.cat(entries))
-        from_inputs, recurrent = flat.view(sum(rows), 2 * n).split(rows)
+        from_inputs, recurrent = th.split(flat.view(sum(rows), 2 * n), rows)
         current = zeros(inputs * m).scatter(0, self.current_index, self.current_weight).view(inputs, m)
         total = value.leak + functional.pad(value.input_conductance, (0, n - m))
         rest = th.cat([value.leak * self.leak_potential, total])
@@ -161,7 +166,7 @@ class ConductanceCell(nn.Module):
 
     @th.no_grad()
     def bounds(self, state_low: float = 0.0, state_high: float = 0.0) -> tuple[th.Tensor, th.Tensor]:
-        """The interval ``[min(V0, V_leak, E), max(...)]`` no potential can leave, per neuron, whatever inputs and steps.
+        """The interval ``[min(V0, V_leak, E), max(...)]`` no potential leaves, per neuron, whatever inputs and steps.
 
         :param state_low: lower bound of the starting potentials
         :param state_high: upper bound of the starting potentials

@@ -1,4 +1,4 @@
-"""The dissipative cell, its bounded-input bounded-state certificate, and how the certificate is kept during training."""
+"""The dissipative cell, its bounded-input bounded-state certificate, and how training keeps it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ class DissipativeCell(nn.Module):
     """``x' = (I + eta K)^-1 [x + eta tanh(W u + U x + b)]`` on the same wiring, diagonal K > 0 (equation 20).
 
     The bracket around both terms is what the contraction factor of equation 21,
-    ``rho = ||(I + eta K)^-1|| (1 + eta L ||U||)`` with L = 1 for tanh, belongs to. Weights carry their synapse's polarity.
+    ``rho = ||(I + eta K)^-1|| (1 + eta L ||U||)`` with L = 1 for tanh, belongs to.
+    Weights carry their synapse's polarity.
 
     :param wiring: who is wired to whom, with polarities
     :param generator: source of the initial values; torch's global one if None
@@ -74,7 +75,9 @@ class DissipativeCell(nn.Module):
             self.register_buffer(f"{name}sign", th.as_tensor(signs[pre, post].astype(np.float32)))
             self.register_buffer(f"{name}index", th.as_tensor(pre * self.n_neurons + post))
         spread = max(1.0, len(self.input_index) / wiring.inter) ** 0.5
-        self.raw_input_weight = nn.Parameter(inverse_softplus(uniform(len(self.input_index), 1.0, 4.0, generator) / spread))
+        self.raw_input_weight = nn.Parameter(
+            inverse_softplus(uniform(len(self.input_index), 1.0, 4.0, generator) / spread)
+        )
         self.raw_weight = nn.Parameter(inverse_softplus(uniform(len(self.index), 0.3, 2.0, generator)))
         self.raw_damping = nn.Parameter(inverse_softplus(uniform(self.n_neurons, 1.0, 3.0, generator)))
         self.bias = nn.Parameter(uniform(self.n_neurons, -0.3, 0.3, generator))
@@ -100,10 +103,10 @@ class DissipativeCell(nn.Module):
 
     def step(self, state: th.Tensor, drive: th.Tensor, arrays: DissipativeArrays, pace: th.Tensor) -> th.Tensor:
         """One sub-step of equation 20 for states ``(batch, n_neurons)``."""
-        recurrent = self._enforced(arrays, pace)
+        recurrent = self.enforced(arrays, pace)
         return (state + pace * th.tanh(drive + state @ recurrent)) / (1.0 + pace * arrays.damping)
 
-    def _enforced(self, arrays: DissipativeArrays, pace: th.Tensor) -> th.Tensor:
+    def enforced(self, arrays: DissipativeArrays, pace: th.Tensor) -> th.Tensor:
         """U, scaled down so that rho <= max_rho: ``||U|| <= (max_rho / ||(I + eta K)^-1|| - 1) / eta``.
 
         ``sqrt(||U||_1 ||U||_inf)`` stands for the spectral norm: never smaller, and cheap and differentiable.
@@ -122,9 +125,7 @@ class DissipativeCell(nn.Module):
         arrays = self.arrays()
         pace = self.pace(arrays, dt)
         shrink = float(1.0 / (1.0 + dt * arrays.damping.min()))
-        recurrent_norm = float(th.linalg.matrix_norm(self._enforced(arrays, pace).double(), 2))
+        recurrent_norm = float(th.linalg.matrix_norm(self.enforced(arrays, pace).double(), 2))
         input_norm = float(th.linalg.matrix_norm(arrays.input_weight.double(), 2))
         rho = shrink * (1.0 + dt * recurrent_norm)
         return Certificate(rho, shrink * dt * input_norm, shrink * dt * float(self.bias.norm()))
-
-

@@ -12,6 +12,7 @@ from torch.nn import functional
 from sb3_tbc.ndbc.cell import ConductanceCell
 from sb3_tbc.ndbc.dissipative import Certificate, DissipativeCell
 from sb3_tbc.ndbc.sequence import unroll
+from sb3_tbc.ndbc.stepping import LipschitzProxy, StepRule, advance_checked
 from sb3_tbc.ndbc.wiring import NDBCWiring
 
 DYNAMICS = ("conductance", "dissipative")
@@ -31,6 +32,8 @@ class NDBCNet(nn.Module):
     :param input_scale: fixed scales the inputs are divided by, ``(n_inputs,)``; by default 1
     :param readout: ``"all"`` sums over all neurons, as the paper's equation does, ``"motor"`` over the motor neurons
     :param max_rho: dissipative only: keep the contraction factor of the certificate below this, during training too
+    :param adaptive_step: choose K by the step-size rule: True, or the fields of :class:`StepRule` that differ from
+        their defaults; K then changes only in :meth:`after_update` and :meth:`refresh_step`, never inside a call
     :param seed: seed of the initial values; by default torch's global stream
     :raises ValueError: if sizes do not fit together or an option is unknown
     """
@@ -45,6 +48,7 @@ class NDBCNet(nn.Module):
         input_scale: Sequence[float] | None = None,
         readout: str = "all",
         max_rho: float | None = None,
+        adaptive_step: bool | Mapping[str, Any] = False,
         seed: int | None = None,
     ) -> None:
         super().__init__()
@@ -69,6 +73,12 @@ class NDBCNet(nn.Module):
         drawn = 2.0 * th.rand(n_outputs, n_read, generator=generator) - 1.0
         self.readout_weight = nn.Parameter(drawn / n_read**0.5)
         self.readout_bias = nn.Parameter(th.zeros(n_outputs))
+        self.lipschitz = LipschitzProxy(self.state_dim)
+        self.step_rule = (
+            None if adaptive_step is False else StepRule(**({} if adaptive_step is True else adaptive_step))
+        )
+        self.updates = 0
+        self.refresh_step()
         self._centre(generator)
 
     def _check_enforceable(self, max_rho: float | None) -> None:
@@ -77,8 +87,8 @@ class NDBCNet(nn.Module):
         least = 1.0 / (1.0 + self.cell.min_damping / self.sub_steps)
         if max_rho <= least:
             raise ValueError(
-                f"max_rho={max_rho} leaves no room for recurrent synapses: with {self.sub_steps} sub-steps and damping of "
-                f"at least {self.cell.min_damping} it must exceed {least:.3f}; use fewer sub-steps or a larger max_rho"
+                f"max_rho={max_rho} leaves no room for recurrent synapses: with {self.sub_steps} sub-steps and damping "
+                f"at least {self.cell.min_damping} it must exceed {least:.3f}; use fewer sub-steps or a larger value"
             )
 
     @th.no_grad()
@@ -132,7 +142,8 @@ class NDBCNet(nn.Module):
         """Potentials after every step of a sequence, ``(batch, time, state_dim)``; arguments as in :meth:`forward`."""
         self._check_shapes(inputs, state, mask, interval, dims=3)
         state = self.initial_state(inputs.shape[0]) if state is None else state
-        if isinstance(self.cell, ConductanceCell) and interval is None:
+        checked = self.step_rule is not None and self.step_rule.half_step_check
+        if isinstance(self.cell, ConductanceCell) and interval is None and not checked:
             return unroll(self.cell, self.cell.arrays(), inputs * self.input_gain, state, mask, self.sub_steps)
         trace = []
         for t in range(inputs.shape[1]):
@@ -149,6 +160,9 @@ class NDBCNet(nn.Module):
         state = self.initial_state(inputs.shape[0]) if state is None else state
         state = state if mask is None else state * mask.unsqueeze(-1)
         cell: Any = self.cell
+        if self.step_rule is not None and self.step_rule.half_step_check:
+            length = state.new_ones(len(state), 1) if interval is None else interval.unsqueeze(-1)
+            return advance_checked(cell, inputs * self.input_gain, state, length, self.sub_steps, self.step_rule)
         arrays = cell.arrays()
         pace = cell.pace(arrays, 1.0 / self.sub_steps if interval is None else interval.unsqueeze(-1) / self.sub_steps)
         drive = cell.drive(inputs * self.input_gain, arrays, pace)
@@ -168,6 +182,44 @@ class NDBCNet(nn.Module):
             if value is not None and tuple(value.shape) != lead:
                 raise ValueError(f"{name} must have one entry per step, shape {lead}, got {tuple(value.shape)}")
 
+    def refresh_step(self) -> int:
+        """Choose K by the step-size rule from the present weights; without a rule K stays as it is."""
+        if self.step_rule is not None:
+            lipschitz = self.lipschitz.evaluate(self.cell, self.step_rule.power_iterations)
+            self.sub_steps = self.step_rule.sub_steps(lipschitz)
+        return self.sub_steps
+
+    def after_update(self, n_updates: int = 1) -> bool:
+        """Tell the step-size rule about updates of the weights.
+
+        :param n_updates: how many there were
+        :return: whether K changed, so that compiled or frozen forms have to be made anew
+        """
+        before, rule = self.updates, self.step_rule
+        self.updates += n_updates
+        if rule is None or before // rule.refresh_every == self.updates // rule.refresh_every:
+            return False
+        sub_steps = self.sub_steps
+        return self.refresh_step() != sub_steps
+
+    @th.no_grad()
+    def time_constants(self, inputs: th.Tensor, state: th.Tensor) -> th.Tensor:
+        """Effective time constants ``1 / (1 / tau_i + sum_j w_ij sigma(V_j) / C_i)`` with ``tau_i = C_i / g_l,i``.
+
+        The sum runs over sensory synapses and the input current too; smaller means faster.
+
+        :param inputs: ``(batch, n_inputs)``
+        :param state: potentials, ``(batch, state_dim)``
+        :return: ``(batch, state_dim)``, in control steps
+        """
+        cell = self.cell
+        if isinstance(cell, DissipativeCell):
+            return (1.0 / cell.arrays().damping).expand(len(state), -1)
+        arrays = cell.arrays()
+        conductance = cell.drive(inputs * self.input_gain, arrays, th.zeros_like(arrays.capacitance))
+        released = th.sigmoid(state[:, : cell.n_presynaptic] * arrays.gain - cell.threshold)
+        return arrays.capacitance / (conductance + released @ arrays.recurrent)[:, self.state_dim :]
+
     def certificate(self) -> Certificate:
         """Bounded-input bounded-state certificate of the dissipative dynamics, per sub-step (equation 21).
 
@@ -179,7 +231,13 @@ class NDBCNet(nn.Module):
 
 
 def _check_options(
-    n_inputs: int, n_outputs: int, wiring: NDBCWiring, sub_steps: int, dynamics: str, readout: str, max_rho: float | None
+    n_inputs: int,
+    n_outputs: int,
+    wiring: NDBCWiring,
+    sub_steps: int,
+    dynamics: str,
+    readout: str,
+    max_rho: float | None,
 ) -> None:
     if n_inputs != wiring.n_inputs:
         raise ValueError(f"n_inputs={n_inputs}, but the wiring has {wiring.n_inputs} sensory neurons")

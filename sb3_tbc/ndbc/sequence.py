@@ -58,7 +58,7 @@ class UnrolledCell(th.autograd.Function):
         return th.stack(trace)
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, grad: th.Tensor) -> tuple[th.Tensor | None, ...]:
         """Gradients of all tensors :meth:`forward` takes, the mask excepted."""
         recurrent, pace, *saved = ctx.saved_tensors

@@ -21,8 +21,8 @@ class NDBCWiring:
     """Sparse wiring sensory -> inter -> command -> motor, drawn once from a seed (paper, section 4.3 and table A1).
 
     Inputs are the sensory neurons; they have no state. The neurons with a membrane potential are numbered inter,
-    command, motor. Targets are drawn evenly, so fan-ins within a layer differ as little as possible, and a neuron that no
-    draw has reached gets one synapse more: every neuron has at least one incoming synapse.
+    command, motor. Targets are drawn evenly, so fan-ins within a layer differ as little as possible, and a neuron that
+    no draw has reached gets one synapse more: every neuron has at least one incoming synapse.
 
     :param n_inputs: number of sensory neurons
     :param inter: number of inter neurons
@@ -177,6 +177,8 @@ def _from_list(synapses: list[list[int]], shape: tuple[int, int]) -> SignMatrix:
     signs = np.zeros(shape, dtype=np.int8)
     for i, j, polarity in synapses:
         if not (0 <= i < shape[0] and 0 <= j < shape[1]) or polarity not in (-1, 1):
-            raise ValueError(f"synapse {[i, j, polarity]} does not fit {shape[0]} x {shape[1]} neurons with polarity +-1")
+            raise ValueError(
+                f"synapse {[i, j, polarity]} does not fit {shape[0]} x {shape[1]} neurons with polarity +-1"
+            )
         signs[i, j] = polarity
     return signs

@@ -1,0 +1,94 @@
+"""Checks and counts outside the hot path: where a value stopped being finite, and how small a network is."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+
+from sb3_tbc.errors import NonFiniteError
+from sb3_tbc.ndbc.wiring import NDBCWiring
+
+if TYPE_CHECKING:
+    from sb3_tbc.ndbc.network import NDBCNet
+
+Values = th.Tensor | NDArray[Any]
+
+
+def check_finite(
+    wiring: NDBCWiring,
+    inputs: Values | None = None,
+    state: Values | None = None,
+    outputs: Values | None = None,
+    level: str = "low",
+    step: int = 0,
+) -> None:
+    """Raise if anything is NaN or infinite, naming level, layer, neuron and step.
+
+    :param wiring: says which layer a neuron belongs to
+    :param inputs: ``(batch, n_inputs)`` or ``(batch, time, n_inputs)``
+    :param state: potentials, ``(batch, N)`` or ``(batch, time, N)``
+    :param outputs: ``(batch, n_outputs)`` or ``(batch, time, n_outputs)``
+    :param level: ``"low"`` or ``"high"``, for the message
+    :param step: number of the first step, for the message
+    :raises NonFiniteError: at the earliest step, and there in the layer nearest to the inputs
+    """
+    named = {"sensory": inputs, "neurons": state, "readout": outputs}
+    found = []
+    for order, (name, values) in enumerate(named.items()):
+        if values is None:
+            continue
+        array = values.detach().cpu().numpy() if isinstance(values, th.Tensor) else np.asarray(values)
+        array = array[:, None] if array.ndim == 2 else array
+        for sample, time, index in np.argwhere(~np.isfinite(array)).tolist():
+            layer = wiring.layer_of(index) if name == "neurons" else name
+            found.append((time, order, index, sample, layer, array[sample, time, index]))
+    if found:
+        time, _, index, sample, layer, value = min(found)
+        start = 0 if layer in ("sensory", "readout") else wiring.layer(layer).start
+        raise NonFiniteError(
+            f"{level} level, {layer} layer, step {step + time}: unit {index - start} of sample {sample} is {value} "
+            f"({len(found)} non-finite values in all); check the inputs' scales and the learning rate"
+        )
+
+
+def check_parameters(net: NDBCNet, level: str = "low", step: int = 0) -> None:
+    """Raise if a parameter or its gradient is NaN or infinite.
+
+    :raises NonFiniteError: names level, parameter and step
+    """
+    for name, parameter in net.named_parameters():
+        for what, tensor in (("value", parameter), ("gradient", parameter.grad)):
+            if tensor is not None and not bool(th.isfinite(tensor).all()):
+                raise NonFiniteError(f"{level} level, {what} of {name}, step {step}: not finite")
+
+
+class ParameterCount(NamedTuple):
+    """Parameters of a network beside those of an MLP with the same inputs and outputs."""
+
+    ndbc: int
+    mlp: int
+    synapses: int
+    neurons: int
+
+    @property
+    def ratio(self) -> float:
+        """NDBC parameters as a share of the MLP's."""
+        return self.ndbc / self.mlp
+
+
+def count_parameters(net: NDBCNet, hidden: Sequence[int] = (64, 64)) -> ParameterCount:
+    """Count trained parameters; what the wiring leaves out has none.
+
+    :param net: the network
+    :param hidden: widths of the MLP it replaces
+    """
+    sizes = (net.n_inputs, *hidden, net.n_outputs)
+    mlp = sum((a + 1) * b for a, b in itertools.pairwise(sizes))
+    return ParameterCount(
+        sum(p.numel() for p in net.parameters()), mlp, net.wiring.n_synapses, net.wiring.n_inputs + net.state_dim
+    )
