@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch as th
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from sb3_tbc.errors import NonFiniteError
+from sb3_tbc.ndbc.diagnostics import check_finite, check_parameters, count_parameters
 from sb3_tbc.ndbc.frozen import FrozenNDBC
 from sb3_tbc.ndbc.network import NDBCNet
+from sb3_tbc.ndbc.stepping import recurrent_block
 from sb3_tbc.ndbc.wiring import NDBCWiring
 
 
@@ -63,3 +67,92 @@ def test_traceable_with_functional_call() -> None:
     for ours, reference in zip(traced(parameters, x, state), gradients(parameters, x, state), strict=True):
         th.testing.assert_close(ours, reference)
     assert all(g.abs().sum() > 0 for g in gradients(parameters, x, state))
+
+
+def test_step_rule_chooses_sub_steps_from_the_lipschitz_proxy() -> None:
+    net = small_net(adaptive_step={"refresh_every": 10, "power_iterations": 200})
+    exact = th.linalg.matrix_norm(recurrent_block(net.cell.arrays()), 2).item()
+    assert net.lipschitz.evaluate(net.cell, 200) == pytest.approx(exact, rel=1e-3)
+    assert net.sub_steps == net.step_rule.sub_steps(exact)
+    with th.no_grad():
+        net.cell.raw_gain += 20.0
+    assert not net.after_update(9), "the proxy is refreshed every ten updates only"
+    assert net.after_update(1)
+    assert net.sub_steps == net.step_rule.max_sub_steps == 6
+    with th.no_grad():
+        net.cell.raw_gain -= 40.0
+    assert net.after_update(10)
+    assert net.sub_steps == 3
+    with pytest.raises(ValueError, match="delta_min"):
+        small_net(adaptive_step={"delta_min": 0.5, "delta_max": 0.2})
+
+
+def test_half_step_check_splits_only_the_samples_that_move_far() -> None:
+    check = {"half_step_check": True, "absolute_tolerance": 2.0, "relative_tolerance": 0.0, "eta": 1e6}
+    checked, plain = small_net(adaptive_step=check), small_net()
+    inputs, state = th.zeros(4, 6), th.zeros(4, plain.state_dim)
+    state[2:] = 3.0  # far from rest: the first sub-step is long
+    expected = plain(inputs, state)[1]
+    plain.sub_steps = 6
+    finer = plain(inputs, state)[1]
+    result = checked(inputs, state)[1]
+    th.testing.assert_close(result, th.cat([expected[:2], finer[2:]]))
+    th.testing.assert_close(checked(inputs.unsqueeze(1), state)[1], result)
+    with pytest.raises(ValueError, match="half_step_check"):
+        FrozenNDBC(checked)
+
+
+def test_non_finite_values_are_named() -> None:
+    net = small_net()
+    inputs = th.randn(3, 5, 6)
+    inputs[1, 2, 0] = float("nan")
+    trace = net.unroll(inputs)
+    with pytest.raises(NonFiniteError, match=r"low level, sensory layer, step 102: unit 0 of sample 1 is nan"):
+        check_finite(net.wiring, inputs, trace, net.read(trace), level="low", step=100)
+    with pytest.raises(NonFiniteError, match=r"low level, inter layer, step 2:"):
+        check_finite(net.wiring, state=trace)
+    check_finite(net.wiring, inputs[0], trace[0], net.read(trace[0]))
+    with th.no_grad():
+        net.cell.raw_leak[0] = float("inf")
+    with pytest.raises(NonFiniteError, match="high level, value of cell.raw_leak, step 7"):
+        check_parameters(net, level="high", step=7)
+
+
+def test_dissipative_frozen_equals_torch() -> None:
+    net = small_net(dynamics="dissipative", max_rho=0.95)
+    x, state = np.random.default_rng(0).normal(size=(3, 6)).astype(np.float32), net.initial_state(3).numpy()
+    outputs, potentials = FrozenNDBC(net)(x, state)
+    reference = net(th.from_numpy(x))
+    np.testing.assert_allclose(outputs, reference[0].detach().numpy(), atol=1e-5)
+    np.testing.assert_allclose(potentials, reference[1].detach().numpy(), atol=1e-5)
+
+
+def test_parameter_count_against_the_mlp_it_replaces() -> None:
+    count = count_parameters(small_net(), hidden=(32, 32))
+    assert count.mlp == 6 * 32 + 32 + 32 * 32 + 32 + 32 * 2 + 2
+    assert count.ndbc == sum(p.numel() for p in small_net().parameters())
+    assert count.ratio < 0.25
+
+
+def test_outputs_start_near_zero_mean() -> None:
+    outputs = small_net(n_outputs=4)(2 * th.rand(4096, 6) - 1)[0]
+    assert float(outputs.mean(dim=0).abs().max()) < 0.05
+    assert float(outputs.std(dim=0).max()) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "named"),
+    [({"sub_steps": 0}, "sub_steps"), ({"dynamics": "chaotic"}, "chaotic"), ({"readout": "none"}, "readout"),
+     ({"input_scale": [1.0]}, "input_scale"), ({"max_rho": 0.9}, "max_rho"), ({"n_outputs": 0}, "n_outputs")],
+)  # fmt: skip
+def test_a_wrong_option_is_named(kwargs: dict[str, object], named: str) -> None:
+    with pytest.raises(ValueError, match=named):
+        small_net(**kwargs)
+
+
+def test_a_wrong_shape_is_named() -> None:
+    net = small_net()
+    with pytest.raises(ValueError, match=r"got shape \(2, 5\)"):
+        net(th.zeros(2, 5))
+    with pytest.raises(ValueError, match="one entry per step"):
+        net(th.zeros(2, 3, 6), mask=th.ones(2))

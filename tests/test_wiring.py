@@ -1,0 +1,91 @@
+"""Wiring: counts of table A1, clipping, reach, polarity, plain data."""
+
+from __future__ import annotations
+
+import json
+import logging
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_tbc.ndbc.wiring import LAYERS, NDBCWiring
+
+TABLE_A1 = {
+    "AntFourRooms": (12, 10, 8, 5, 8, 2, 6),
+    "UR5Reacher": (6, 4, 3, 4, 5, 2, 5),
+    "Drawbridge": (6, 6, 1, 3, 4, 3, 4),
+    "Tennis2D": (8, 6, 3, 4, 6, 4, 6),
+    "Pendulum": (6, 6, 1, 3, 4, 1, 4),
+    "Platforms": (6, 6, 1, 4, 5, 3, 5),
+}  # inter, command, motor, sensory fan-out, inter fan-out, recurrent command synapses, motor fan-in (paper, table A1)
+
+
+def blocks(wiring: NDBCWiring) -> dict[str, np.ndarray]:
+    inter, command, motor = (wiring.layer(name) for name in LAYERS)
+    return {
+        "inter->command": wiring.recurrent[inter, command],
+        "command->command": wiring.recurrent[command, command],
+        "command->motor": wiring.recurrent[command, motor],
+    }
+
+
+@pytest.mark.parametrize("task", TABLE_A1)
+def test_table_a1_fans_are_met_exactly_or_clipped_with_a_note(task: str, caplog: pytest.LogCaptureFixture) -> None:
+    inter, command, motor, sensory_fan, inter_fan, recurrent, motor_fan = TABLE_A1[task]
+    with caplog.at_level(logging.INFO, logger="sb3_tbc"):
+        wiring = NDBCWiring(9, *TABLE_A1[task], seed=3)
+    part = blocks(wiring)
+    assert (np.count_nonzero(wiring.sensory, axis=1) == min(sensory_fan, inter)).all()
+    assert (np.count_nonzero(part["inter->command"], axis=1) == min(inter_fan, command)).all()
+    assert np.count_nonzero(part["command->command"]) == recurrent
+    assert (np.count_nonzero(part["command->motor"], axis=0) == min(motor_fan, command)).all()
+    clipped = inter_fan > command or motor_fan > command
+    assert clipped == bool(wiring.notes) == ("clipped" in caplog.text)
+    if task == "UR5Reacher":
+        assert len(wiring.notes) == 2
+
+
+@given(st.integers(1, 12), st.integers(1, 8), st.integers(1, 8), st.integers(1, 5), st.data())
+@settings(max_examples=60, deadline=None)
+def test_layers_reach_and_polarity(n_inputs: int, inter: int, command: int, motor: int, data: st.DataObject) -> None:
+    fans = [data.draw(st.integers(least, 9)) for least in (1, 1, 0, 1)]
+    wiring = NDBCWiring(n_inputs, inter, command, motor, *fans, seed=data.draw(st.integers(0, 99)))
+    incoming = np.count_nonzero(wiring.sensory, axis=0) + np.count_nonzero(wiring.recurrent, axis=0)
+    assert (incoming >= 1).all()
+    assert set(np.unique(wiring.sensory)) | set(np.unique(wiring.recurrent)) <= {-1, 0, 1}
+    assert not wiring.sensory[:, inter:].any(), "sensory neurons project to inter neurons only"
+    inside = sum(np.count_nonzero(block) for block in blocks(wiring).values())
+    assert inside == np.count_nonzero(wiring.recurrent), "no synapse outside the four-layer scheme"
+    assert not np.diag(wiring.recurrent).any(), "no autapses"
+    assert NDBCWiring.from_dict(json.loads(json.dumps(wiring.to_dict()))) == wiring
+
+
+def test_seed_decides_the_draw() -> None:
+    numbers = TABLE_A1["AntFourRooms"]
+    assert NDBCWiring(9, *numbers, seed=1) == NDBCWiring(9, *numbers, seed=1)
+    assert NDBCWiring(9, *numbers, seed=1) != NDBCWiring(9, *numbers, seed=2)
+
+
+def test_from_numbers_as_plain_data() -> None:
+    names = ("inter", "command", "motor", "sensory_fanout", "inter_fanout", "recurrent_command_synapses", "motor_fanin")
+    numbers = dict(zip(names, TABLE_A1["Pendulum"], strict=True))
+    assert NDBCWiring.from_dict({"n_inputs": 6, **numbers}) == NDBCWiring(6, **numbers)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"), [({"inter": 0}, "inter"), ({"motor_fanin": 0}, "motor_fanin"), ({"command": 2.5}, "command")]
+)
+def test_a_wrong_size_is_named(change: dict[str, float], named: str) -> None:
+    names = ("inter", "command", "motor", "sensory_fanout", "inter_fanout", "recurrent_command_synapses", "motor_fanin")
+    numbers = dict(zip(names, TABLE_A1["Pendulum"], strict=True)) | change
+    with pytest.raises(ValueError, match=named):
+        NDBCWiring(6, **numbers)
+
+
+def test_a_synapse_to_nowhere_is_refused() -> None:
+    data = NDBCWiring(6, *TABLE_A1["Pendulum"]).to_dict()
+    data["synapses"].append([0, 13, 1])
+    with pytest.raises(ValueError, match="13, 1"):
+        NDBCWiring.from_dict(data)
