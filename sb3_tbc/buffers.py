@@ -14,8 +14,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tbc.hindsight import HighLevelSteps, LowLevelSteps, ordered_pairs
+from sb3_tbc.layout import LevelLayout
 from sb3_tbc.options import OptionRules
-from sb3_tbc.spaces import SubgoalSpace
 from sb3_tbc.type_aliases import LevelBatch
 
 Float32 = NDArray[np.float32]
@@ -168,7 +168,7 @@ class SubgoalReplayBuffer(RingBuffer):
         buffer_size: int,
         observation_space: spaces.Box,
         action_space: spaces.Box,
-        subgoals: SubgoalSpace,
+        layout: LevelLayout,
         rules: OptionRules,
         state_dim: int,
         gamma: float,
@@ -176,6 +176,7 @@ class SubgoalReplayBuffer(RingBuffer):
         device: th.device | str = "cpu",
         seed: int | None = None,
     ) -> None:
+        subgoals = layout.subgoals
         widths = {
             "local": subgoals.local_dim,
             "next_local": subgoals.local_dim,
@@ -183,6 +184,7 @@ class SubgoalReplayBuffer(RingBuffer):
             "states": state_dim,
             "next_states": state_dim,
             "subgoal": subgoals.dim,
+            "here": subgoals.dim,
             "achieved": subgoals.dim,
             "time_left": 1,
             "position": 1,
@@ -191,7 +193,7 @@ class SubgoalReplayBuffer(RingBuffer):
             "dones": 1,
         }
         super().__init__(buffer_size, observation_space, action_space, widths, device, seed)
-        self.subgoals, self.rules, self.gamma = subgoals, rules, gamma
+        self.layout, self.rules, self.gamma = layout, rules, gamma
         self.relabelled_share = n_hindsight_goals / (n_hindsight_goals + 1.0)
 
     def extend(self, steps: LowLevelSteps) -> None:
@@ -216,16 +218,16 @@ class SubgoalReplayBuffer(RingBuffer):
         time_left[where, 0] = second - first + 1 - self.rng.random(len(where), dtype=np.float32)
         expired = (second == first)[:, None]
         if self.rules.window_end == "reached":
-            reached = self.subgoals.reached(data["achieved"][at[where]], subgoal[where])[:, None]
+            reached = self.layout.subgoals.reached(data["achieved"][at[where]], subgoal[where])[:, None]
             rewards[where], dones[where] = reached, reached | expired
         else:
             rewards[where] = dones[where] = expired
         scale = np.float32(1.0 / self.rules.dt_max)
         now, later = (np.clip(t * scale, 0.0, 1.0) for t in (time_left, time_left - 1.0))
         return (
-            np.concatenate([data["local"][at], subgoal, now], axis=1),
+            self.layout.low_from(data["local"][at], data["here"][at], subgoal, now),
             data["actions"][at],
-            np.concatenate([data["next_local"][at], subgoal, later], axis=1),
+            self.layout.low_from(data["next_local"][at], data["achieved"][at], subgoal, later),
             rewards,
             dones,
             np.full_like(rewards, self.gamma),

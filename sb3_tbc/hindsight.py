@@ -86,7 +86,8 @@ class LowLevelSteps(NamedTuple):
     states: FloatArray
     next_states: FloatArray
     subgoal: FloatArray  # what was asked for, task units
-    achieved: FloatArray  # subgoal-space point after the step
+    here: FloatArray  # subgoal-space point before the step
+    achieved: FloatArray  # and after it
     time_left: FloatArray  # (T,) steps of the budget left before the step
     position: NDArray[np.int64]  # (T,) steps since the window began
     length: NDArray[np.int64]  # (T,) steps the window took
@@ -104,33 +105,27 @@ def low_level_steps(episode: Episode, subgoals: SubgoalSpace, rules: OptionRules
     per_step = np.repeat(np.arange(len(lengths)), lengths)
     budget = np.array([option.time_budget for option in episode.options])[per_step]
     subgoal = np.stack([option.subgoal for option in episode.options])[per_step]
-    achieved = subgoals.achieved(_successors(episode))
-    reached = subgoals.reached(achieved, subgoal)
+    seen = _rows(episode, np.arange(episode.length + 1))
+    local, points = subgoals.local(seen), subgoals.achieved(seen)
+    reached = subgoals.reached(points[1:], subgoal)
     over = position + 1 >= budget
     if rules.window_end == "reached":
         over = over | (reached & (position + 1 >= rules.dt_min))
     return LowLevelSteps(
-        local=episode.local[:-1],
-        next_local=episode.local[1:],
+        local=local[:-1],
+        next_local=local[1:],
         actions=episode.actions,
         states=episode.states,
         next_states=episode.next_states,
         subgoal=subgoal,
-        achieved=achieved,
+        here=points[:-1],
+        achieved=points[1:],
         time_left=budget - position,
         position=position,
         length=lengths[per_step],
         rewards=(over & reached).astype(np.float64),
         dones=over,
     )
-
-
-def _successors(episode: Episode) -> dict[str, FloatArray]:
-    return {
-        "observation": episode.observation[1:],
-        "achieved_goal": episode.achieved_goal[1:],
-        "desired_goal": episode.desired_goal[1:],
-    }
 
 
 def ordered_pairs(length: NDArray[np.int64], rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -100,7 +100,6 @@ class Episode(NamedTuple):
     observation: FloatArray  # (T+1, obs_dim)
     achieved_goal: FloatArray  # (T+1, goal_dim), float64: hindsight rewards are exact
     desired_goal: FloatArray  # (T+1, goal_dim), float64
-    local: FloatArray  # (T+1, local_dim)
     actions: FloatArray  # (T, action_dim), unit coordinates
     states: FloatArray  # (T, state_dim), membrane potentials before the step
     next_states: FloatArray  # (T, state_dim), and after it

@@ -75,6 +75,18 @@ class SubgoalSpace:
         """Number of entries of the low level's view of the task."""
         return len(self.local_scale)
 
+    @property
+    def resolution_scale(self) -> FloatArray:
+        """Scale of each coordinate for a circuit's input: a threshold becomes 0.15, unless the bounds are nearer.
+
+        Neurons of moderate gain must tell a subgoal from its neighbours; scaled by its bounds alone, a threshold of
+        4 % of the range moves them too little.
+        """
+        per_coordinate = np.empty(self.dim)
+        for group, threshold in zip(self.groups, self.thresholds, strict=True):
+            per_coordinate[list(group)] = threshold
+        return np.minimum(per_coordinate / 0.15, np.maximum(np.abs(self.low), np.abs(self.high)))
+
     def achieved(self, observation: GoalObservation) -> FloatArray:
         """Subgoal-space point of a goal observation, ``(..., subgoal_dim)``, task units."""
         return self._achieved(observation)

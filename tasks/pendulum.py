@@ -7,10 +7,12 @@ from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
+from .drawing import draw_pendulum
 from .mujoco_task import MujocoTask
 
 MODEL = """
@@ -26,6 +28,7 @@ MODEL = """
 </mujoco>
 """
 MAX_SPEED = 15.0
+TYPICAL_SPEED = 4.0  # rad/s, on the way up
 
 
 class Pendulum(MujocoTask):
@@ -55,7 +58,7 @@ class Pendulum(MujocoTask):
 
     def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
         goal_scale = np.array([math.pi, MAX_SPEED])
-        local_scale = np.array([1.0, 1.0, MAX_SPEED])
+        local_scale = np.array([1.0, 1.0, TYPICAL_SPEED])
         subgoals = SubgoalSpace(
             low=-goal_scale,
             high=goal_scale,
@@ -79,6 +82,9 @@ class Pendulum(MujocoTask):
         angle, speed = self._qpos.item(), self._qvel.item()
         achieved = [(angle + math.pi) % (2 * math.pi) - math.pi, min(max(speed, -MAX_SPEED), MAX_SPEED)]
         return np.array([math.cos(angle), math.sin(angle), speed]), achieved
+
+    def _draw(self) -> NDArray[np.uint8]:
+        return draw_pendulum(self._qpos.item(), self._qvel.item(), self._goal, self._overlay, self._elapsed)
 
 
 def _local(observation: GoalObservation) -> FloatArray:

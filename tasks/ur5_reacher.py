@@ -12,15 +12,17 @@ from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
 from .history import FrameHistory
+from .mujoco_rendering import ASSETS, GOAL_RGBA, SUBGOAL_RGBA, Scene
 from .mujoco_task import MujocoTask
 
 N_FRAMES = 8
 MAX_SPEED = 4.0
+TYPICAL_ANGLE = 1.2  # rad, what the joints move by in an episode
 BASE_HEIGHT, UPPER_ARM, FOREARM = 0.089159, 0.425, 0.39225
 START = (3.22757851e-03, -1.27944547e-01)
 
-MODEL = """
-<mujoco model="ur5">
+MODEL = f"""
+<mujoco model="ur5">{ASSETS}
   <compiler angle="radian" autolimits="true"/>
   <option timestep="0.002" gravity="0 0 -9.81" cone="elliptic" impratio="5" tolerance="1e-10"/>
   <default>
@@ -29,27 +31,28 @@ MODEL = """
     <general gaintype="fixed" biastype="affine" gainprm="10" biasprm="0 0 -10" forcerange="-150 150"/>
   </default>
   <worldbody>
-    <geom name="floor" type="plane" size="5 5 0.1"/>
+    <light pos="1 -1 3" dir="-0.3 0.3 -1" directional="true" diffuse="0.5 0.5 0.5"/>
+    <geom name="floor" type="plane" size="5 5 0.1" material="tiles"/>
     <body name="base_link">
       <inertial pos="0 0 0" quat="0.5 0.5 -0.5 0.5" mass="4" diaginertia="0.0072 0.00443333 0.00443333"/>
-      <geom type="cylinder" size="0.0735 0.012" pos="0 0 0.009"/>
+      <geom type="cylinder" size="0.0735 0.012" pos="0 0 0.009" material="joint"/>
       <body name="shoulder_link" pos="0 0 0.089159">
         <inertial pos="0 0 0" mass="3.7" diaginertia="0.0102675 0.0102675 0.00666"/>
         <joint name="shoulder_pan" axis="0 0 1"/>
-        <geom type="cylinder" size="0.0595 0.0668" pos="0 0 0.0016"/>
+        <geom type="cylinder" size="0.0595 0.0668" pos="0 0 0.0016" material="joint"/>
         <body name="upper_arm_link" pos="0 0.13585 0" quat="0.707107 0 0.707107 0">
           <inertial pos="0 0 0.28" mass="8.393" diaginertia="0.226891 0.226891 0.0151074"/>
           <joint name="shoulder_lift" axis="0 1 0"/>
-          <geom type="cylinder" size="0.0597" fromto="0 -0.0652 0 0 0.0686 0"/>
-          <geom type="cylinder" size="0.0597" fromto="0 -0.0652 0.425 0 0.0672 0.425"/>
-          <geom type="box" size="0.0597 0.0669 0.2125" pos="0 0.0017 0.2125"/>
+          <geom type="cylinder" size="0.0597" fromto="0 -0.0652 0 0 0.0686 0" material="joint"/>
+          <geom type="cylinder" size="0.0597" fromto="0 -0.0652 0.425 0 0.0672 0.425" material="joint"/>
+          <geom type="box" size="0.0597 0.0669 0.2125" pos="0 0.0017 0.2125" material="body"/>
           <body name="forearm_link" pos="0 -0.1197 0.425">
             <inertial pos="0 0 0.25" mass="2.275" diaginertia="0.0494433 0.0494433 0.004095"/>
             <joint name="elbow" axis="0 1 0"/>
-            <geom type="sphere" size="0.058"/>
-            <geom type="capsule" size="0.0525" fromto="0 0 0.05 0 0 0.15"/>
-            <geom type="capsule" size="0.0455" fromto="0 0 0.15 0 0 0.27"/>
-            <geom type="cylinder" size="0.0385" fromto="0 0 0.27 0 0 0.4313"/>
+            <geom type="sphere" size="0.058" material="joint"/>
+            <geom type="capsule" size="0.0525" fromto="0 0 0.05 0 0 0.15" material="body"/>
+            <geom type="capsule" size="0.0455" fromto="0 0 0.15 0 0 0.27" material="body"/>
+            <geom type="cylinder" size="0.0385" fromto="0 0 0.27 0 0 0.4313" material="body"/>
           </body>
         </body>
       </body>
@@ -117,6 +120,15 @@ class UR5Reacher(MujocoTask):
             return np.array(frame), achieved
         return self._history.reset(frame) if first else self._history.push(frame), achieved
 
+    def _make_scene(self) -> Scene:
+        return Scene(self.model, (640, 480), lookat=(0.0, 0.0, 0.3), distance=2.6, azimuth=150.0, elevation=-22.0)
+
+    def _add_markers(self, scene: Scene) -> None:
+        scene.add_ghost(self._goal, GOAL_RGBA)
+        subgoal = self._overlay[0]
+        if subgoal is not None:
+            scene.add_ghost(subgoal[:3], SUBGOAL_RGBA)
+
 
 def describe_arm(n_frames: int) -> tuple[Array, Array, SubgoalSpace]:
     """Scales and subgoal space of the reaching task, whichever engine moves the arm.
@@ -124,7 +136,7 @@ def describe_arm(n_frames: int) -> tuple[Array, Array, SubgoalSpace]:
     :param n_frames: frames of angles and velocities in the observation
     :return: observation scale, goal scale, subgoal space
     """
-    local_scale = np.array([math.pi] * 3 + [MAX_SPEED] * 3)
+    local_scale = np.array([TYPICAL_ANGLE] * 3 + [MAX_SPEED] * 3)
     bound = np.array([2 * math.pi] * 3 + [MAX_SPEED] * 3)
     subgoals = SubgoalSpace(
         low=-bound,

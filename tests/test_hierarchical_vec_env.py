@@ -14,8 +14,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tbc.errors import HierarchyError
 from sb3_tbc.hindsight import HighLevelReward, discounted_sums
+from sb3_tbc.layout import LevelLayout
 from sb3_tbc.options import OptionRules, TerminationReason
-from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, LevelLayout, Proposal
+from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 
 
 class RandomHighLevel:
@@ -77,7 +78,7 @@ def test_every_step_belongs_to_exactly_one_option(n_envs: int, seed: int, dt_max
         # nothing of another episode or environment: the corridor counts its own steps, and one serial number is kept
         assert np.array_equal(episode.observation[:, 1], np.arange(episode.length + 1))
         assert len(set(episode.observation[:, 2])) == 1
-        np.testing.assert_allclose(np.diff(episode.local[:, 0]), 0.1 * episode.actions[:, 0], atol=1e-6)
+        np.testing.assert_allclose(np.diff(episode.observation[:, 0]), 0.1 * episode.actions[:, 0], atol=1e-6)
 
 
 @settings(max_examples=15, deadline=None)

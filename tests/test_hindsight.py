@@ -18,8 +18,8 @@ from sb3_tbc.hindsight import (
     relabel_actions,
     relabel_goals,
 )
+from sb3_tbc.layout import LevelLayout
 from sb3_tbc.options import Episode, Option, OptionRules, TerminationReason
-from sb3_tbc.vec_env.hierarchical_vec_env import LevelLayout
 
 ENV = Corridor()
 RULES = OptionRules(dt_max=4.0, max_options=5)
@@ -41,7 +41,6 @@ def episode() -> Episode:
         observation=rows,
         achieved_goal=position[:, None],
         desired_goal=np.full((6, 1), 0.5),
-        local=rows,
         actions=np.ones((5, 1), np.float32),
         states=np.zeros((5, 2), np.float32),
         next_states=np.ones((5, 2), np.float32),
@@ -125,9 +124,7 @@ def test_ordered_pairs_are_uniform() -> None:
 
 
 def low_buffer(size: int, hindsight: float, rules: OptionRules = RULES) -> SubgoalReplayBuffer:
-    return SubgoalReplayBuffer(
-        size, LAYOUT.low_space(), ENV.action_space, ENV.subgoals, rules, 2, 0.99, hindsight, seed=0
-    )
+    return SubgoalReplayBuffer(size, LAYOUT.low_space(), ENV.action_space, LAYOUT, rules, 2, 0.99, hindsight, seed=0)
 
 
 def test_relabelled_low_level_samples_are_consistent() -> None:

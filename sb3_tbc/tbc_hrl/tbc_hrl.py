@@ -28,6 +28,7 @@ from sb3_tbc.hindsight import (
     high_level_steps,
     low_level_steps,
 )
+from sb3_tbc.layout import LevelLayout, check_goal_space
 from sb3_tbc.options import Episode, OptionRules
 from sb3_tbc.spaces import FloatArray, SubgoalSpace
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
@@ -35,7 +36,7 @@ from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.tbc_hrl.policies import LevelPolicy
 from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, attribute_of, level_settings
 from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
-from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, LevelLayout, Proposal, check_goal_space
+from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
 
@@ -73,6 +74,7 @@ class TBCHRL(BaseAlgorithm):
     :param gradient_ratio: updates of each level per environment step, done in bursts after episodes
     :param learning_starts: environment steps before the first update
     :param memory: when the membrane is reset: ``"window"``, ``"episode"`` or ``"none"`` (every step)
+    :param relative_subgoals: show the low level the distance to its subgoal instead of the subgoal itself
     :param subgoals: the subgoal space, for environments that do not bring one
     :param compile: compile the updates: ``"auto"`` (where a C++ compiler is found), True or False
     :raises ValueError: on unknown settings or an environment without goals
@@ -108,6 +110,7 @@ class TBCHRL(BaseAlgorithm):
         gradient_ratio: float = 1.0,
         learning_starts: int = 0,
         memory: str = "window",
+        relative_subgoals: bool = False,
         subgoals: SubgoalSpace | None = None,
         compile: bool | str = "auto",
         stats_window_size: int = 100,
@@ -140,7 +143,7 @@ class TBCHRL(BaseAlgorithm):
         self.goal_strategy = goal_strategy
         self.gradient_ratio, self.learning_starts = gradient_ratio, learning_starts
         self.memory, self.compile = memory, compile
-        self.subgoals = subgoals
+        self.subgoals, self.relative_subgoals = subgoals, relative_subgoals
         self._n_updates = 0
         self._updated_at = 0
         if _init_setup_model:
@@ -160,7 +163,7 @@ class TBCHRL(BaseAlgorithm):
         if self.subgoals is None:
             raise ValueError("no subgoal space: pass subgoals=SubgoalSpace(...), or an environment that has .subgoals")
         self.rules = OptionRules(self.dt_max, self.dt_min, self.max_options, self.window_end)
-        self.layout = LevelLayout(self.subgoals, self.achieved_in_observation)
+        self.layout = LevelLayout(self.subgoals, self.achieved_in_observation, self.relative_subgoals)
         self.high_reward = HighLevelReward(
             self.target, self.high_settings["gamma"], self.rules.dt_ref, self.rules.dt_max,
             self.decision_cost, self.duration_cost,
@@ -175,7 +178,7 @@ class TBCHRL(BaseAlgorithm):
             self.high_settings["buffer_size"], *high_spaces, device=self.device, seed=seeds[3]
         )
         low_buffer = SubgoalReplayBuffer(
-            self.low_settings["buffer_size"], *low_spaces, subgoals=self.subgoals, rules=self.rules,
+            self.low_settings["buffer_size"], *low_spaces, layout=self.layout, rules=self.rules,
             state_dim=self.low.state_dim, gamma=self.low_settings["gamma"],
             n_hindsight_goals=self.low_settings.get("n_hindsight_goals", self.n_hindsight_goals),
             device=self.device, seed=seeds[4],
@@ -235,7 +238,7 @@ class TBCHRL(BaseAlgorithm):
         if circuit is None:
             return None
         subgoals = self.layout.subgoals
-        scale = np.concatenate([subgoals.local_scale, np.maximum(np.abs(subgoals.low), np.abs(subgoals.high)), [1.0]])
+        scale = np.concatenate([subgoals.local_scale, subgoals.resolution_scale, [1.0]])
         return {"input_scale": scale.tolist(), **circuit}
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:

@@ -10,10 +10,10 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_tbc.layout import GOAL_KEYS, LevelLayout
 from sb3_tbc.options import OptionRules
 from sb3_tbc.spaces import FloatArray
 from sb3_tbc.tbc_hrl.level import SACLevel
-from sb3_tbc.vec_env.hierarchical_vec_env import GOAL_KEYS, LevelLayout
 
 
 class TwoLevelState(NamedTuple):
@@ -91,7 +91,7 @@ class TBCPolicy(BasePolicy):
             starts |= np.asarray(episode_start, dtype=bool)
         self._begin_options(now, batch, starts, deterministic)
         remaining = self.rules.remaining(now.time_budget - now.elapsed)
-        seen = self.layout.low(self.layout.subgoals.local(batch), now.subgoal, remaining)
+        seen = self.layout.low(batch, now.subgoal, remaining)
         unit, membrane = self._levels[1].act(seen, now.membrane, deterministic, self.rng, average=deterministic)
         actions = self._unscale(unit)
         after = now._replace(elapsed=now.elapsed + 1, membrane=membrane)
@@ -113,6 +113,7 @@ class TBCPolicy(BasePolicy):
             seen = self.layout.high({key: batch[key][where] for key in GOAL_KEYS})
             no_state = np.zeros((len(where), 0), dtype=np.float32)
             unit, _ = self._levels[0].act(seen, no_state, deterministic, self.rng, average=deterministic)
+            unit = unit.astype(np.float64)  # as while learning: a rounding error can change the length of a window
             now.subgoal[where] = self.layout.subgoals.unscale(unit[:, :-1])
             now.time_budget[where] = self.rules.budget(unit[:, -1])
             now.elapsed[where] = 0

@@ -174,6 +174,7 @@ class SACUpdate:
         :return: mean over the burst of each of :data:`DIAGNOSTICS`
         """
         n_steps, batch_size = batch.rewards.shape[:2]
+        self._check(batch, noise)
         stats = th.zeros(len(DIAGNOSTICS))
         state = [stats, ent_coef.data, *self._state()]
         rows = self._schedules(n_steps, tau, target_entropy).unbind(0)
@@ -183,6 +184,19 @@ class SACUpdate:
         for optimizer in self.optimizers():
             self._adam_state(optimizer)["step"] += n_steps
         return dict(zip(DIAGNOSTICS, (stats / n_steps).tolist(), strict=True))
+
+    def _check(self, batch: LevelBatch, noise: th.Tensor) -> None:
+        """The compiled step trusts shapes and types, so they are checked here, once per burst."""
+        lead = tuple(batch.rewards.shape[:2])
+        obs_dim, state_dim = math.prod(self.policy.observation_space.shape or ()), self.policy.actor.state_dim
+        widths = (obs_dim, self.action_dim, obs_dim, 1, 1, 1, state_dim, state_dim)
+        expected = {name: (*lead, width) for name, width in zip(LevelBatch._fields, widths, strict=True)}
+        expected["noise"] = (lead[0], 2, lead[1], self.action_dim)
+        for name, x in (*batch._asdict().items(), ("noise", noise)):
+            if tuple(x.shape) != expected[name] or x.dtype != th.float32 or not x.is_contiguous():
+                raise ValueError(
+                    f"batch.{name} must be contiguous float32 of shape {expected[name]}, got {x.dtype} {tuple(x.shape)}"
+                )
 
     def optimizers(self) -> list[th.optim.Optimizer]:
         """Actor's, critics' and, when the temperature is automatic, the temperature's optimizer."""
@@ -242,9 +256,6 @@ class SACUpdate:
             ent_coef = ent.exp() if automatic else ent.clone()
             surplus = (log_prob + row.target_entropy).mean()
             ent_coef_loss = -(ent * surplus).sum() if automatic else ent.new_zeros(())
-            if automatic:
-                options = self.optimizers()[2].param_groups[0]
-                adam_(options, ent, -surplus.expand(1), (moments[4], moments[5]), row.ent_coef_step, row.correction)
             blocks = self.actor.unflatten(actor)
             mean, log_std, _ = policy.actor.step_blocks(blocks, constants, batch.next_observations, batch.next_states)
             next_actions, next_log_prob = squash(mean, log_std, noise[1])
@@ -264,6 +275,9 @@ class SACUpdate:
             (actor_grad,) = th.autograd.grad(actor_loss, actor_leaf)
         actor_options = policy.actor.optimizer.param_groups[0]
         adam_(actor_options, actor, actor_grad, (moments[0], moments[1]), row.actor_step, row.correction)
+        if automatic:  # last, so that nothing changes while both forward passes of the actor share what they compute
+            ent_options = self.optimizers()[2].param_groups[0]
+            adam_(ent_options, ent, -surplus.expand(1), (moments[4], moments[5]), row.ent_coef_step, row.correction)
         target.lerp_(critic, row.tau)
         average.lerp_(actor, row.average_weight)
         diagnostics = (critic_loss, actor_loss, ent_coef_loss, ent_coef.sum(), q.mean(), -log_prob.mean())

@@ -12,11 +12,10 @@ from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tbc.errors import HierarchyError
+from sb3_tbc.layout import GOAL_KEYS, LevelLayout, check_goal_space, width
 from sb3_tbc.options import Episode, OptionClock, OptionRules
-from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
+from sb3_tbc.spaces import FloatArray, GoalObservation
 from sb3_tbc.vec_env.recorder import EpisodeRecorder
-
-GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
 class Proposal(NamedTuple):
@@ -28,61 +27,6 @@ class Proposal(NamedTuple):
 
 HighLevel = Callable[[FloatArray, NDArray[np.intp]], Proposal]
 """Maps high-level observations ``(n, high_dim)`` of the environments ``(n,)`` to their next options."""
-
-
-def check_goal_space(space: spaces.Space[Any]) -> spaces.Dict:
-    """Return the space if it is that of a goal environment.
-
-    :raises ValueError: naming what is missing
-    """
-    if not isinstance(space, spaces.Dict) or any(key not in space.spaces for key in GOAL_KEYS):
-        found = sorted(space.spaces) if isinstance(space, spaces.Dict) else type(space).__name__
-        raise ValueError(
-            f"a hierarchical agent needs a goal environment: a Dict observation with the keys {sorted(GOAL_KEYS)}, "
-            f"got {found}. Derive it from gymnasium_robotics.core.GoalEnv."
-        )
-    for key in GOAL_KEYS:
-        part = space.spaces[key]
-        if not isinstance(part, spaces.Box) or len(part.shape) != 1:
-            raise ValueError(f"observation[{key!r}] must be a Box with one dimension, got {part}")
-    return space
-
-
-def width(space: spaces.Dict, key: str) -> int:
-    """Number of entries of a part of a goal observation."""
-    return int(np.prod(space.spaces[key].shape or ()))
-
-
-class LevelLayout(NamedTuple):
-    """How the flat observation vectors of both levels are put together."""
-
-    subgoals: SubgoalSpace
-    achieved_in_observation: bool
-
-    def high(self, observation: GoalObservation) -> FloatArray:
-        """What the high level sees: desired goal, observation and, where the task needs it, achieved goal."""
-        parts = [observation["desired_goal"], observation["observation"]]
-        if not self.achieved_in_observation:
-            parts.append(observation["achieved_goal"])
-        return np.concatenate(parts, axis=-1).astype(np.float32)
-
-    def low(self, local: FloatArray, subgoal: FloatArray, remaining: FloatArray) -> FloatArray:
-        """What the low level sees: local state, subgoal (task units), remaining time in [0, 1]."""
-        return np.concatenate([local, subgoal, np.asarray(remaining)[..., None]], axis=-1).astype(np.float32)
-
-    def high_space(self, space: spaces.Dict) -> spaces.Box:
-        """Observation space of the high level."""
-        keys = ["desired_goal", "observation"] + ([] if self.achieved_in_observation else ["achieved_goal"])
-        size = sum(width(space, key) for key in keys)
-        return spaces.Box(-np.inf, np.inf, (size,), np.float32)
-
-    def low_space(self) -> spaces.Box:
-        """Observation space of the low level."""
-        return spaces.Box(-np.inf, np.inf, (self.subgoals.local_dim + self.subgoals.dim + 1,), np.float32)
-
-    def high_action_space(self) -> spaces.Box:
-        """Action space of the high level in unit coordinates: subgoal, then time budget."""
-        return spaces.Box(-1.0, 1.0, (self.subgoals.dim + 1,), np.float32)
 
 
 class HierarchicalVecEnv(VecEnvWrapper):
@@ -131,7 +75,6 @@ class HierarchicalVecEnv(VecEnvWrapper):
             )
         return {
             **sizes,
-            "local": self.layout.subgoals.local_dim,
             "actions": actions[0],
             "states": state_dim,
             "next_states": state_dim,
@@ -140,11 +83,10 @@ class HierarchicalVecEnv(VecEnvWrapper):
     def reset(self) -> FloatArray:
         """Reset every environment and ask for its first option."""
         observation: GoalObservation = self.venv.reset()  # type: ignore[assignment]
-        local = self.layout.subgoals.local(observation)
-        self._begin_episodes(self._everywhere, observation, local)
+        self._begin_episodes(self._everywhere, observation)
         self._begin_options(self._everywhere, observation)
         self._started = True
-        return self._low_observation(local)
+        return self._low_observation(observation)
 
     def remember(self, states: FloatArray, next_states: FloatArray) -> None:
         """Membrane potentials before and after the coming step, ``(n_envs, state_dim)``, to be recorded with it."""
@@ -164,16 +106,15 @@ class HierarchicalVecEnv(VecEnvWrapper):
         """Advance every environment by one step; close and replace the options that end with it."""
         observation, rewards, dones, infos = self.venv.step_wait()
         seen = self._before_reset(observation, dones, infos)  # type: ignore[arg-type]
-        local = self.layout.subgoals.local(seen)
-        self._recorder.after_step(rewards, seen, local)
+        self._recorder.after_step(rewards, seen)
         self.clock.tick()
         reached, ended = self._window_ends(seen, dones)
         low_rewards = np.zeros(self.num_envs, dtype=np.float32)
         if ended.any():
             where = np.flatnonzero(ended)
             low_rewards[where] = self._close_options(where, seen, reached, dones, infos)
-            local = self._next_options(where, observation, local, dones, infos)  # type: ignore[arg-type]
-        return self._low_observation(local), low_rewards, ended, infos
+            self._next_options(where, observation, dones, infos)  # type: ignore[arg-type]
+        return self._low_observation(observation), low_rewards, ended, infos
 
     def _unit_actions(self, actions: FloatArray) -> FloatArray:
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
@@ -230,19 +171,16 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self,
         where: NDArray[np.intp],
         observation: dict[str, FloatArray],
-        local: FloatArray,
         dones: NDArray[np.bool_],
         infos: list[dict[str, Any]],
-    ) -> FloatArray:
-        """Finish episodes, begin options; the local view after automatic and enforced resets."""
+    ) -> None:
+        """Finish episodes and begin options; enforced resets change ``observation`` in place."""
         over = where[dones[where] | (self.clock.used[where] >= self.rules.max_options)]
         for index in over:
             self._finish_episode(index, observation, bool(dones[index]), infos[index])
         if len(over):
-            local = self.layout.subgoals.local(observation)
-            self._begin_episodes(over, {key: observation[key][over] for key in GOAL_KEYS}, local[over])
+            self._begin_episodes(over, {key: observation[key][over] for key in GOAL_KEYS})
         self._begin_options(where, observation)
-        return local
 
     def _finish_episode(self, index: int, observation: dict[str, FloatArray], done: bool, info: dict[str, Any]) -> None:
         truncated = bool(info.get("TimeLimit.truncated", False)) or not done
@@ -259,9 +197,9 @@ class HierarchicalVecEnv(VecEnvWrapper):
             for key in GOAL_KEYS:
                 observation[key][index] = fresh[key]
 
-    def _begin_episodes(self, where: NDArray[np.intp], observation: GoalObservation, local: FloatArray) -> None:
+    def _begin_episodes(self, where: NDArray[np.intp], observation: GoalObservation) -> None:
         self.clock.begin_episode(where)
-        self._recorder.begin(where, observation, local)
+        self._recorder.begin(where, observation)
 
     def _begin_options(self, where: NDArray[np.intp], observation: GoalObservation) -> None:
         if self.high_level is None:
@@ -271,6 +209,6 @@ class HierarchicalVecEnv(VecEnvWrapper):
         subgoal = self.layout.subgoals.unscale(proposal.unit_actions[:, :-1])
         self.clock.begin(where, proposal.unit_actions, subgoal, proposal.testing)
 
-    def _low_observation(self, local: FloatArray) -> FloatArray:
+    def _low_observation(self, observation: GoalObservation) -> FloatArray:
         remaining = self.rules.remaining(self.clock.time_left)
-        return self.layout.low(local, self.clock.subgoal, remaining)
+        return self.layout.low(observation, self.clock.subgoal, remaining)

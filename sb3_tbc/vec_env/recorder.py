@@ -30,12 +30,12 @@ class EpisodeRecorder:
         }
         self._rewards = np.zeros((n_envs, capacity + 1))
 
-    def begin(self, indices: NDArray[np.intp], observation: GoalObservation, local: FloatArray) -> None:
+    def begin(self, indices: NDArray[np.intp], observation: GoalObservation) -> None:
         """Start new episodes; the arrays have one row per entry of ``indices``."""
         self.steps[indices] = 0
         for index in indices:
             self.options[index] = []
-        self._write(indices, self.steps[indices], observation, local)
+        self._write(indices, self.steps[indices], observation)
 
     def before_step(self, actions: FloatArray, states: FloatArray, next_states: FloatArray) -> None:
         """What the low level is about to do in every environment, and its memory before and after."""
@@ -47,16 +47,16 @@ class EpisodeRecorder:
             self._data["states"][at] = states
             self._data["next_states"][at] = next_states
 
-    def after_step(self, rewards: FloatArray, observation: GoalObservation, local: FloatArray) -> None:
+    def after_step(self, rewards: FloatArray, observation: GoalObservation) -> None:
         """What the step led to in every environment, before any automatic reset."""
         self._rewards[self._all, self.steps] = rewards
         self.steps += 1
-        self._write(self._all, self.steps, observation, local)
+        self._write(self._all, self.steps, observation)
 
     def finish(self, index: int, terminated: bool, success: bool) -> Episode:
         """The episode that has just ended in environment ``index``, as arrays of its own."""
         length = int(self.steps[index])
-        seen = {n: self._data[n][index, : length + 1].copy() for n in ("observation", *self._exact, "local")}
+        seen = {n: self._data[n][index, : length + 1].copy() for n in ("observation", *self._exact)}
         done = {n: self._data[n][index, :length].copy() for n in ("actions", "states", "next_states")}
         return Episode(
             **seen,
@@ -67,12 +67,9 @@ class EpisodeRecorder:
             success=success,
         )
 
-    def _write(
-        self, rows: NDArray[np.intp], steps: NDArray[np.int64], observation: GoalObservation, local: FloatArray
-    ) -> None:
+    def _write(self, rows: NDArray[np.intp], steps: NDArray[np.int64], observation: GoalObservation) -> None:
         for name in ("observation", *self._exact):
             self._data[name][rows, steps] = observation[name]
-        self._data["local"][rows, steps] = local
 
     def _grow(self) -> None:
         for name, array in self._data.items():
