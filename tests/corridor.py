@@ -45,7 +45,7 @@ class Corridor(GoalEnv):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
         super().reset(seed=seed)
         self.position, self.steps = 0.0, 0
-        self.episode += 1
+        self.episode = 1 if seed is not None else self.episode + 1
         self.goal = self.fixed_goal if self.fixed_goal is not None else float(self.np_random.uniform(-1, 1))
         return self._observation(), {}
 
