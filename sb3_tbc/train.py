@@ -65,7 +65,7 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
     return RunSpec(
         run,
         env_id,
-        variant=args.variant or variant_name(args.ablation, run.config),
+        variant=args.variant or variant_name(args.ablation, args.config),
         seed=args.seed,
         eval_freq=args.eval_freq or max(run.n_timesteps // 40, 500),
         n_eval_episodes=args.n_eval_episodes,
@@ -73,8 +73,8 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
     )
 
 
-def variant_name(ablation: str | None, config: str) -> str:
-    """Folder name of a variant: ``full`` or the ablation, with ``-paper`` when the tables' values are used."""
+def variant_name(ablation: str | None, config: str | None) -> str:
+    """Folder name of a variant: ``full`` or the ablation, with ``-paper`` when the tables' values were asked for."""
     return (ablation or "full") + ("-paper" if config == "paper" else "")
 
 

@@ -1,0 +1,71 @@
+"""The campaign: what it runs, what it leaves alone, how it goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sb3_tbc import reproduce
+from sb3_tbc.zoo.ledger import LEDGER_FILES, RunFolder
+
+TINY = [
+    "--hyperparams",
+    "compile:false",
+    "gradient_ratio:0.02",
+    "low.batch_size:8",
+    "high.batch_size:4",
+    "max_options:3",
+]
+
+
+def campaign(tmp_path: Path, *more: str) -> list[str]:
+    folders = ["--log-folder", str(tmp_path / "runs"), "--ledger", str(tmp_path / "results")]
+    return ["--tasks", "Pendulum", "--algos", "hits", "tbc-hrl", "--seeds", "2", *folders, *more]
+
+
+def test_every_first_seed_comes_before_any_second(tmp_path: Path) -> None:
+    order = [(job.seed, job.algo) for job in reproduce.jobs(campaign(tmp_path))]
+    assert order == [(0, "hits"), (0, "tbc-hrl"), (1, "hits"), (1, "tbc-hrl")]
+
+
+def test_finished_runs_are_not_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    done = RunFolder.of(tmp_path / "results", "Pendulum", "hits", "full", 0)
+    done.path.mkdir(parents=True)
+    for name in LEDGER_FILES:
+        (done.path / name).write_text("{}")
+    assert reproduce.main(campaign(tmp_path, "--dry-run")) == 0
+    out = capsys.readouterr().out
+    assert "4 runs, 1 of them in" in out
+    assert "hits full seed 0" not in out
+    assert "hits full seed 1" in out
+
+
+def test_an_interrupted_run_is_resumed(tmp_path: Path) -> None:
+    job = next(iter(reproduce.jobs(campaign(tmp_path))))
+    assert "--overwrite" in job.command()
+    job.folder.start({}, "x")
+    assert "--overwrite" in job.command()
+    job.folder.checkpoint.mkdir()
+    (job.folder.checkpoint / "state.json").write_text("{}")
+    assert job.command()[-2:] == ["--resume", str(job.folder.path)]
+
+
+def test_mistakes_are_told_before_anything_runs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert reproduce.main([*campaign(tmp_path), "--tasks", "Pendulum", "UR5"]) == 2
+    assert "unknown environment 'UR5'" in capsys.readouterr().err
+    assert reproduce.main([*campaign(tmp_path), "--hyperparams", "low.gama:1"]) == 2
+    assert "did you mean 'gamma'" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_a_small_campaign_fills_the_ledger(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = ["--n-timesteps", "300", "--eval-freq", "300", "--n-final-episodes", "1", *TINY]
+    arguments = campaign(tmp_path, "--seeds", "1", *small)
+    assert reproduce.main(arguments) == 0
+    for algo in ("hits", "tbc-hrl"):
+        folder = RunFolder.of(tmp_path / "results", "Pendulum", algo, "full", 0)
+        assert sorted(p.name for p in folder.path.iterdir()) == sorted(LEDGER_FILES)
+    assert reproduce.main(arguments) == 0
+    assert "0 to do" in capsys.readouterr().out
