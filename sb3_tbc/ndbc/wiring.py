@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -140,6 +140,36 @@ class NDBCWiring:
         wiring.sensory = _from_list(data["sensory_synapses"], (wiring.n_inputs, wiring.n_neurons))
         wiring.recurrent = _from_list(data["synapses"], (wiring.n_neurons, wiring.n_neurons))
         return wiring
+
+    @classmethod
+    def from_ncps(cls, wiring: Any) -> NDBCWiring:
+        """The same neurons and synapses as a built ``ncps.wirings.NCP`` or ``AutoNCP``.
+
+        ncps numbers motor neurons first; here they come last.
+
+        :param wiring: an ncps wiring, after ``wiring.build(n_inputs)``
+        :raises ValueError: if it was not built or has no inter, command and motor neurons
+        """
+        if getattr(wiring, "sensory_adjacency_matrix", None) is None:
+            raise ValueError("the ncps wiring does not know its inputs yet: call wiring.build(n_inputs) first")
+        types = [wiring.get_type_of_neuron(i) for i in range(wiring.units)]
+        members = [[i for i, kind in enumerate(types) if kind == name] for name in LAYERS]
+        if not all(members):
+            raise ValueError(f"need inter, command and motor neurons, as in NCP and AutoNCP; got {sorted(set(types))}")
+        order = [i for layer in members for i in layer]
+        drawn = cls.__new__(cls)
+        sensory = np.asarray(wiring.sensory_adjacency_matrix)
+        drawn._set_sizes(len(sensory), *(len(m) for m in members))
+        drawn.seed, drawn.notes = 0, ("from ncps",)
+        drawn.sensory = np.sign(sensory[:, order]).astype(np.int8)
+        drawn.recurrent = np.sign(np.asarray(wiring.adjacency_matrix)[np.ix_(order, order)]).astype(np.int8)
+        return drawn
+
+    def draw(self, ax: Any = None, input_names: Sequence[str] | None = None) -> Any:
+        """Draw neurons and synapses with matplotlib; see :func:`sb3_tbc.ndbc.drawing.draw_wiring`."""
+        from sb3_tbc.ndbc.drawing import draw_wiring
+
+        return draw_wiring(self, ax, input_names)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, NDBCWiring) and self.to_dict() == other.to_dict()

@@ -174,6 +174,7 @@ class SACUpdate:
         :return: mean over the burst of each of :data:`DIAGNOSTICS`
         """
         n_steps, batch_size = batch.rewards.shape[:2]
+        batch = LevelBatch(*(x.contiguous() for x in batch))
         self._check(batch, noise)
         stats = th.zeros(len(DIAGNOSTICS))
         state = [stats, ent_coef.data, *self._state()]
@@ -193,9 +194,9 @@ class SACUpdate:
         expected = {name: (*lead, width) for name, width in zip(LevelBatch._fields, widths, strict=True)}
         expected["noise"] = (lead[0], 2, lead[1], self.action_dim)
         for name, x in (*batch._asdict().items(), ("noise", noise)):
-            if tuple(x.shape) != expected[name] or x.dtype != th.float32 or not x.is_contiguous():
+            if tuple(x.shape) != expected[name] or x.dtype != th.float32:
                 raise ValueError(
-                    f"batch.{name} must be contiguous float32 of shape {expected[name]}, got {x.dtype} {tuple(x.shape)}"
+                    f"batch.{name} must be float32 of shape {expected[name]}, got {x.dtype} {tuple(x.shape)}"
                 )
 
     def optimizers(self) -> list[th.optim.Optimizer]:
