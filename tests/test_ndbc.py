@@ -114,7 +114,7 @@ def test_non_finite_values_are_named() -> None:
     check_finite(net.wiring, inputs[0], trace[0], net.read(trace[0]))
     with th.no_grad():
         net.cell.raw_leak[0] = float("inf")
-    with pytest.raises(NonFiniteError, match="high level, value of cell.raw_leak, step 7"):
+    with pytest.raises(NonFiniteError, match=r"high level, value of cell.raw_leak, step 7"):
         check_parameters(net, level="high", step=7)
 
 

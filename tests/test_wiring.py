@@ -33,7 +33,7 @@ def blocks(wiring: NDBCWiring) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("task", TABLE_A1)
 def test_table_a1_fans_are_met_exactly_or_clipped_with_a_note(task: str, caplog: pytest.LogCaptureFixture) -> None:
-    inter, command, motor, sensory_fan, inter_fan, recurrent, motor_fan = TABLE_A1[task]
+    inter, command, _, sensory_fan, inter_fan, recurrent, motor_fan = TABLE_A1[task]
     with caplog.at_level(logging.INFO, logger="sb3_tbc"):
         wiring = NDBCWiring(9, *TABLE_A1[task], seed=3)
     part = blocks(wiring)
@@ -89,3 +89,35 @@ def test_a_synapse_to_nowhere_is_refused() -> None:
     data["synapses"].append([0, 13, 1])
     with pytest.raises(ValueError, match="13, 1"):
         NDBCWiring.from_dict(data)
+
+
+def test_from_ncps_keeps_every_synapse() -> None:
+    ncps = pytest.importorskip("ncps.wirings")
+    theirs = ncps.AutoNCP(20, 3, seed=7)
+    with pytest.raises(ValueError, match="build"):
+        NDBCWiring.from_ncps(theirs)
+    theirs.build(5)
+    ours = NDBCWiring.from_ncps(theirs)
+    assert (ours.n_inputs, ours.n_neurons, ours.motor) == (5, 20, 3)
+    assert np.count_nonzero(ours.sensory) == np.count_nonzero(theirs.sensory_adjacency_matrix)
+    motor = ours.layer("motor").start
+    for i, j in np.argwhere(theirs.adjacency_matrix):  # ncps: motor neurons first, then command, then inter
+        place = [motor + k if k < 3 else None for k in (i, j)]
+        if place[1] is not None:
+            assert theirs.adjacency_matrix[:, j].sum() == ours.recurrent[:, place[1]].sum()
+    assert np.count_nonzero(ours.recurrent) == np.count_nonzero(theirs.adjacency_matrix)
+    full = ncps.FullyConnected(8, 2)
+    full.build(3)
+    with pytest.raises(ValueError, match="NCP"):
+        NDBCWiring.from_ncps(full)
+
+
+def test_it_draws_every_synapse() -> None:
+    pytest.importorskip("matplotlib").use("Agg")
+    wiring = NDBCWiring(9, *TABLE_A1["UR5Reacher"])
+    ax = wiring.draw(input_names=[f"input {i}" for i in range(9)])
+    arrows = [text for text in ax.texts if getattr(text, "arrow_patch", None) is not None]
+    assert len(arrows) == wiring.n_synapses
+    assert sum(len(c.get_offsets()) for c in ax.collections) == wiring.n_inputs + wiring.n_neurons
+    with pytest.raises(ValueError, match="9 input names"):
+        wiring.draw(input_names=["one"])

@@ -1,0 +1,66 @@
+"""NDBCNet as a features extractor of any Stable-Baselines3 policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+
+from sb3_tbc.ndbc.network import NDBCNet
+from sb3_tbc.ndbc.wiring import NDBCWiring
+
+
+class NDBCExtractor(BaseFeaturesExtractor):
+    """Features read out of an NDBC circuit that starts at rest for every observation.
+
+    SB3's extractors have no memory: the K sub-steps are all the time the circuit gets. For memory between steps use
+    :class:`NDBCNet` itself, or the low level of ``TBCHRL``.
+
+    Use it as ``policy_kwargs={"features_extractor_class": NDBCExtractor, "features_extractor_kwargs": {...}}``.
+
+    :param observation_space: a Box, or a Dict of Boxes, whose entries are joined in the order of their keys
+    :param features_dim: number of features
+    :param wiring: the wiring's numbers, as :class:`NDBCWiring` takes them, without ``n_inputs``
+    :param input_scale: fixed scales the joined observation is divided by; by default the largest finite bound of each
+        entry, and 1 where there is none
+    :param kwargs: further options of :class:`NDBCNet`
+    :raises ValueError: for other spaces
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        features_dim: int = 32,
+        wiring: Mapping[str, Any] | None = None,
+        input_scale: Sequence[float] | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, features_dim)
+        is_dict = isinstance(observation_space, spaces.Dict)
+        parts = list(observation_space.spaces.values()) if is_dict else [observation_space]  # type: ignore[attr-defined]
+        boxes = [part for part in parts if isinstance(part, spaces.Box)]
+        if len(boxes) < len(parts):
+            raise ValueError(f"NDBCExtractor takes a Box or a Dict of Boxes, got {observation_space}")
+        bounds = np.concatenate([np.maximum(np.abs(box.low), np.abs(box.high)).ravel() for box in boxes])
+        usable = np.isfinite(bounds) & (bounds > 0) & (bounds < 1e6)
+        scale = np.where(usable, bounds, 1.0).tolist() if input_scale is None else input_scale
+        drawn = NDBCWiring(len(bounds), **(DEFAULT_NUMBERS | dict(wiring or {})))
+        self.net = NDBCNet(len(bounds), features_dim, drawn, input_scale=scale, **kwargs)
+
+    def forward(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
+        """Features ``(batch, features_dim)``."""
+        if isinstance(observations, dict):
+            observations = th.cat([part.flatten(1) for part in observations.values()], dim=1)
+        features: th.Tensor = self.net(observations.flatten(1))[0]
+        return features
+
+
+DEFAULT_NUMBERS = {
+    "inter": 12, "command": 10, "motor": 8,
+    "sensory_fanout": 5, "inter_fanout": 8, "recurrent_command_synapses": 2, "motor_fanin": 6,
+}  # fmt: skip
+"""Table A1's largest wiring, AntFourRooms."""
