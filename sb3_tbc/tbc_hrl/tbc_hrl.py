@@ -67,8 +67,8 @@ class TBCHRL(BaseAlgorithm):
     :param testing_fraction: share of options that test their subgoal
     :param deterministic_testing: whether the low level acts deterministically in a test (the public HiTS does not)
     :param testing_penalty: reward of a failed test, None for ``-max_options``
-    :param exhaustion_penalty: price of using up the action budget; above 0 that ends the episode for the high level, which
-        then sees how much of the budget is left; at 0 it is a truncation that nobody sees coming (HiTS)
+    :param exhaustion_penalty: price of using up the action budget; above 0 that ends the episode for the high level,
+        which then sees how much of the budget is left; at 0 it is a truncation that nobody sees coming (HiTS)
     :param keep_original: also learn from failed options as they were chosen (paper, algorithm 1)
     :param random_fraction: share of uniformly random actions on each level while exploring
     :param n_hindsight_goals: hindsight goals per transition
