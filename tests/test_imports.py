@@ -21,6 +21,7 @@ LAYERS = {
     "sb3_tbc.stats": 0,
     "sb3_tbc.tasks": 1,
     "sb3_tbc.ndbc": 1,
+    "sb3_tbc.layout": 1,
     "sb3_tbc.options": 2,
     "sb3_tbc.hindsight": 2,
     "sb3_tbc.plotting": 2,
