@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from sb3_tbc.tbc_hrl import compilation
 from sb3_tbc.tbc_hrl.level import SACLevel, SpacesOnlyVecEnv
@@ -196,6 +197,36 @@ def test_auto_falls_back_with_one_log_line(monkeypatch: pytest.MonkeyPatch, capl
     assert "eagerly" in caplog.records[0].message
     with pytest.raises(RuntimeError, match="no C\\+\\+ compiler"):
         make_level(make_batches(), compile=True).train(1, BATCH)
+
+
+@pytest.mark.parametrize("field", ["rewards", "observations", "states"])
+def test_wrong_batches_are_refused(field: str) -> None:
+    batches = make_batches()
+    level = make_level(batches._replace(**{field: getattr(batches, field).double()}))
+    with pytest.raises(ValueError, match=f"batch.{field} must be float32"):
+        level.train(1, BATCH)
+
+
+def test_graph_passes_keep_the_numbers() -> None:
+    level = make_level(make_batches())
+    update = level._update
+    batch = level.replay_buffer.sample_burst(1, BATCH)
+    noise = level_noise(level, 1)
+    row = update._schedules(1, 0.01, -2.0)[0]
+    example = [th.zeros(6), level.log_ent_coef.data, *update._state(), row, noise[0], *(x[0] for x in batch)]
+    graph = make_fx(update._step)(*(x.clone() for x in example))
+    n_nodes = len(graph.graph.nodes)
+    compilation.split_bias_from_products(graph)
+    compilation.merge_repeated(graph)
+    targets = [str(node.target) for node in graph.graph.nodes]
+    assert not any("addmm" in t or "baddbmm" in t for t in targets)
+    assert len(targets) != n_nodes
+    ours, theirs = ([x.clone() for x in example] for _ in range(2))
+    graph(*ours)
+    update._step(*theirs)
+    for a, b, before in zip(ours, theirs, example, strict=True):
+        assert th.allclose(a, b, atol=1e-6)
+        assert not th.equal(a, before) or a.numel() == 0 or any(a is x for x in ours[-10:])
 
 
 def test_unknown_compile_value() -> None:
