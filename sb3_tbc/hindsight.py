@@ -156,7 +156,6 @@ class HindsightSettings(NamedTuple):
     n_goals: int  # goal copies per option
     goal_strategy: str  # "future" or "episode"
     testing_penalty: float  # reward of a testing transition, negative
-    exhaustion_penalty: float  # added where the action budget is used up, which then ends the episode; 0: a truncation
     keep_original: bool  # also store failed options as they were chosen (paper, algorithm 1 line 26)
 
 
@@ -214,7 +213,7 @@ def high_level_steps(
     reward: HighLevelReward,
     settings: HindsightSettings,
     goal_test: GoalTest,
-    high_view: Callable[[dict[str, FloatArray], FloatArray], FloatArray],
+    high_view: Callable[[dict[str, FloatArray]], FloatArray],
     rng: np.random.Generator,
 ) -> HighLevelSteps:
     """All SMDP transitions that the high level learns from in one episode, in this order:
@@ -222,7 +221,7 @@ def high_level_steps(
     testing transitions (failed tests, chosen action, penalty), hindsight-action transitions of all options, and
     copies of these with hindsight goals.
 
-    :param high_view: maps goal observations and the share of options left to the high level's flat observation
+    :param high_view: maps goal observations to the high level's flat observation
     """
     n = len(episode.options)
     starts = np.array([option.start for option in episode.options])
@@ -235,9 +234,6 @@ def high_level_steps(
     rewards = reward.of(episode.rewards, starts, durations)
     dones = np.zeros(n, dtype=bool)
     dones[-1] = episode.terminated
-    exhausted = np.zeros(n, dtype=bool)
-    exhausted[-1] = episode.exhausted and settings.exhaustion_penalty != 0.0
-    left = rules.options_left(np.arange(n + 1))
 
     def steps(
         rows: NDArray[np.int64],
@@ -251,10 +247,8 @@ def high_level_steps(
         old, new = ({k: v[rows] for k, v in part.items()} for part in (before, after))
         if goals is not None:
             old["desired_goal"] = new["desired_goal"] = goals
-        fails = exhausted[rows] & ~dones
         return HighLevelSteps(
-            high_view(old, left[rows]), actions, rewards + settings.exhaustion_penalty * fails,
-            high_view(new, left[rows + 1]), dones | fails, reward.discounts(durations),
+            high_view(old), actions, rewards, high_view(new), dones, reward.discounts(durations),
             failed[rows] & relabelled, durations,
         )  # fmt: skip
 

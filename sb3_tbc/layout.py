@@ -41,18 +41,12 @@ class LevelLayout(NamedTuple):
     subgoals: SubgoalSpace
     achieved_in_observation: bool = True
     relative_subgoals: bool = False
-    observe_budget: bool = False
 
-    def high(self, observation: GoalObservation, options_left: FloatArray) -> FloatArray:
-        """What the high level sees: desired goal, observation and, where needed, achieved goal and action budget left.
-
-        :param options_left: share of the episode's action budget that is left, ``(...)``, in [0, 1]
-        """
+    def high(self, observation: GoalObservation) -> FloatArray:
+        """What the high level sees: desired goal, observation and, where the task needs it, achieved goal."""
         parts = [observation["desired_goal"], observation["observation"]]
         if not self.achieved_in_observation:
             parts.append(observation["achieved_goal"])
-        if self.observe_budget:
-            parts.append(options_left[..., None])
         return np.concatenate(parts, axis=-1).astype(np.float32)
 
     def low(self, observation: GoalObservation, subgoal: FloatArray, remaining: FloatArray) -> FloatArray:
@@ -70,7 +64,7 @@ class LevelLayout(NamedTuple):
     def high_space(self, space: spaces.Dict) -> spaces.Box:
         """Observation space of the high level."""
         keys = ["desired_goal", "observation"] + ([] if self.achieved_in_observation else ["achieved_goal"])
-        size = sum(width(space, key) for key in keys) + self.observe_budget
+        size = sum(width(space, key) for key in keys)
         return spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
     def low_space(self) -> spaces.Box:

@@ -63,10 +63,6 @@ class OptionRules:
         """Unit action coordinate of a time budget, clipped to [-1, 1]."""
         return np.asarray(np.clip(2.0 * (steps - self.dt_min) / (self.dt_max - self.dt_min) - 1.0, -1.0, 1.0))
 
-    def options_left(self, used: NDArray[np.int64]) -> FloatArray:
-        """Share of the action budget that is left after ``used`` options."""
-        return np.asarray(1.0 - used / self.max_options)
-
     def remaining(self, steps: FloatArray) -> FloatArray:
         """Remaining time as the low level sees it: ``clip(dt_rem / dt_max, 0, 1)`` (paper section 4.1)."""
         return np.asarray(np.clip(steps / self.dt_max, 0.0, 1.0))
@@ -111,7 +107,6 @@ class Episode(NamedTuple):
     options: tuple[Option, ...]
     terminated: bool
     success: bool
-    exhausted: bool  # ended because the action budget was used up
 
     @property
     def length(self) -> int:

@@ -48,7 +48,6 @@ def episode() -> Episode:
         options=(option(0, 3, 0.9, 2.5, True, False), option(3, 2, 0.5, 1.5, False, True)),
         terminated=True,
         success=True,
-        exhausted=False,
     )
 
 
@@ -100,9 +99,7 @@ def test_relabelled_goal_met_inside_a_window_ends_it_there() -> None:
 
 def test_all_high_level_transitions_by_hand() -> None:
     reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=2.0)
-    settings = HindsightSettings(
-        n_goals=1, goal_strategy="future", testing_penalty=-5.0, exhaustion_penalty=0.0, keep_original=False
-    )
+    settings = HindsightSettings(n_goals=1, goal_strategy="future", testing_penalty=-5.0, keep_original=False)
     steps = high_level_steps(
         episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0)
     )
@@ -170,7 +167,7 @@ def test_ring_never_mixes_windows_after_wrapping() -> None:
 def test_option_buffer_gives_sb3_samples_with_discounts() -> None:
     buffer = OptionReplayBuffer(50, LAYOUT.high_space(ENV.observation_space), LAYOUT.high_action_space(), seed=0)
     reward = HighLevelReward("smdp", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
-    settings = HindsightSettings(0, "future", -5.0, 0.0, keep_original=True)
+    settings = HindsightSettings(0, "future", -5.0, keep_original=True)
     buffer.extend(
         high_level_steps(episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
     )
@@ -194,19 +191,3 @@ def test_buffer_state_round_trip_and_mismatch() -> None:
         other.set_state(state)
     with pytest.raises(ValueError, match="does not fit"):
         low_buffer(3, 1).extend(low_level_steps(episode(), ENV.subgoals, RULES))
-
-
-def test_used_up_budget_is_terminal_and_penalised_where_asked_for() -> None:
-    layout = LevelLayout(ENV.subgoals, True, observe_budget=True)
-    reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0)
-    cut = episode()._replace(terminated=False, success=False, exhausted=True, rewards=np.full(5, -1.0))
-    for penalty, last_done in ((-7.0, True), (0.0, False)):
-        settings = HindsightSettings(0, "future", -5.0, penalty, keep_original=False)
-        steps = high_level_steps(
-            cut, ENV.subgoals, OptionRules(4.0, max_options=2), reward, settings, GOALS, layout.high,
-            np.random.default_rng(0),
-        )  # fmt: skip
-        np.testing.assert_array_equal(steps.rewards, [-5, -1, -1 + penalty])
-        np.testing.assert_array_equal(steps.dones, [False, False, last_done])
-        np.testing.assert_allclose(steps.observations[:, -1], [1, 1, 0.5])
-        np.testing.assert_allclose(steps.next_observations[:, -1], [0.5, 0.5, 0])

@@ -67,8 +67,6 @@ class TBCHRL(BaseAlgorithm):
     :param testing_fraction: share of options that test their subgoal
     :param deterministic_testing: whether the low level acts deterministically in a test (the public HiTS does not)
     :param testing_penalty: reward of a failed test, None for ``-max_options``
-    :param exhaustion_penalty: price of using up the action budget; above 0 that ends the episode for the high level,
-        which then sees how much of the budget is left; at 0 it is a truncation that nobody sees coming (HiTS)
     :param keep_original: also learn from failed options as they were chosen (paper, algorithm 1)
     :param random_fraction: share of uniformly random actions on each level while exploring
     :param n_hindsight_goals: hindsight goals per transition
@@ -105,7 +103,6 @@ class TBCHRL(BaseAlgorithm):
         testing_fraction: float = 0.3,
         deterministic_testing: bool = False,
         testing_penalty: float | None = None,
-        exhaustion_penalty: float = 0.0,
         keep_original: bool = False,
         random_fraction: float = 0.05,
         n_hindsight_goals: float = 3,
@@ -142,7 +139,6 @@ class TBCHRL(BaseAlgorithm):
         self.decision_cost, self.duration_cost = decision_cost, duration_cost
         self.testing_fraction, self.deterministic_testing = testing_fraction, deterministic_testing
         self.testing_penalty, self.keep_original = testing_penalty, keep_original
-        self.exhaustion_penalty = exhaustion_penalty
         self.random_fraction, self.n_hindsight_goals = random_fraction, n_hindsight_goals
         self.goal_strategy = goal_strategy
         self.gradient_ratio, self.learning_starts = gradient_ratio, learning_starts
@@ -167,9 +163,7 @@ class TBCHRL(BaseAlgorithm):
         if self.subgoals is None:
             raise ValueError("no subgoal space: pass subgoals=SubgoalSpace(...), or an environment that has .subgoals")
         self.rules = OptionRules(self.dt_max, self.dt_min, self.max_options, self.window_end)
-        self.layout = LevelLayout(
-            self.subgoals, self.achieved_in_observation, self.relative_subgoals, self.exhaustion_penalty != 0
-        )
+        self.layout = LevelLayout(self.subgoals, self.achieved_in_observation, self.relative_subgoals)
         self.high_reward = HighLevelReward(
             self.target, self.high_settings["gamma"], self.rules.dt_ref, self.rules.dt_max,
             self.decision_cost, self.duration_cost,
@@ -346,7 +340,6 @@ class TBCHRL(BaseAlgorithm):
             int(self.n_hindsight_goals),
             self.goal_strategy,
             -float(self.max_options) if self.testing_penalty is None else self.testing_penalty,
-            -abs(self.exhaustion_penalty),
             self.keep_original,
         )
         for episode in episodes:

@@ -110,8 +110,7 @@ class TBCPolicy(BasePolicy):
         now.membrane[forget] = 0.0
         where = np.flatnonzero(over)
         if len(where):
-            left = self.rules.options_left(np.minimum(now.used[where], self.rules.max_options))
-            seen = self.layout.high({key: batch[key][where] for key in GOAL_KEYS}, left)
+            seen = self.layout.high({key: batch[key][where] for key in GOAL_KEYS})
             no_state = np.zeros((len(where), 0), dtype=np.float32)
             unit, _ = self._levels[0].act(seen, no_state, deterministic, self.rng, average=deterministic)
             unit = unit.astype(np.float64)  # as while learning: a rounding error can change the length of a window

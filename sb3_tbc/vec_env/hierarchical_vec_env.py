@@ -185,7 +185,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
     def _finish_episode(self, index: int, observation: dict[str, FloatArray], done: bool, info: dict[str, Any]) -> None:
         truncated = bool(info.get("TimeLimit.truncated", False)) or not done
         success = bool(info.get("is_success", False)) and done
-        episode = self._recorder.finish(index, terminated=not truncated, success=success, exhausted=not done)
+        episode = self._recorder.finish(index, terminated=not truncated, success=success)
         self.episodes.append(episode)
         info["episode_over"] = True
         info["budget_exhausted"] = not done
@@ -205,7 +205,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         if self.high_level is None:
             raise HierarchyError("HierarchicalVecEnv needs a high level that proposes options: set .high_level")
         seen = {key: observation[key][where] for key in GOAL_KEYS}
-        proposal = self.high_level(self.layout.high(seen, self.rules.options_left(self.clock.used[where])), where)
+        proposal = self.high_level(self.layout.high(seen), where)
         subgoal = self.layout.subgoals.unscale(proposal.unit_actions[:, :-1])
         self.clock.begin(where, proposal.unit_actions, subgoal, proposal.testing)
 

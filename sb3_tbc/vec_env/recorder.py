@@ -53,7 +53,7 @@ class EpisodeRecorder:
         self.steps += 1
         self._write(self._all, self.steps, observation)
 
-    def finish(self, index: int, terminated: bool, success: bool, exhausted: bool) -> Episode:
+    def finish(self, index: int, terminated: bool, success: bool) -> Episode:
         """The episode that has just ended in environment ``index``, as arrays of its own."""
         length = int(self.steps[index])
         seen = {n: self._data[n][index, : length + 1].copy() for n in ("observation", *self._exact)}
@@ -65,7 +65,6 @@ class EpisodeRecorder:
             options=tuple(self.options[index]),
             terminated=terminated,
             success=success,
-            exhausted=exhausted,
         )
 
     def _write(self, rows: NDArray[np.intp], steps: NDArray[np.int64], observation: GoalObservation) -> None:
