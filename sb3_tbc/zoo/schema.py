@@ -55,7 +55,6 @@ MODEL: Schema = {
     "testing_fraction": NUMBER,
     "deterministic_testing": bool,
     "testing_penalty": NUMBER,
-    "exhaustion_penalty": NUMBER,
     "relative_subgoals": bool,
     "keep_original": bool,
     "random_fraction": NUMBER,
