@@ -111,6 +111,20 @@ def test_loading_the_policy_alone_is_seen_by_act() -> None:
     assert np.array_equal(level.act(*args)[0], other.act(*args)[0])
 
 
+def test_step_size_rule_reaches_acting_and_updates() -> None:
+    level = make_level({**NDBC, "adaptive_step": {"refresh_every": 4, "eta": 1e-3}})
+    level.actor.net.sub_steps = level.policy.average_actor.net.sub_steps = 3
+    level.train(2, 16)
+    assert set(level._update._steps) == {(16, 3)}
+    level.train(2, 16)  # the rule is asked every 4 updates; so small an eta asks for K_max
+    level.train(2, 16)
+    assert set(level._update._steps) == {(16, 3), (16, 6)}
+    assert level.policy.average_actor.sub_steps == 6
+    obs, states = inputs(level)
+    mean, _, _ = level.actor.step(th.from_numpy(obs), th.from_numpy(states))
+    assert np.allclose(level.act(obs, states, True, np.random.default_rng(0))[0], mean.tanh().detach(), atol=1e-6)
+
+
 def test_same_seed_same_weights() -> None:
     levels = [make_level(NDBC), make_level(NDBC)]
     for level in levels:
@@ -164,7 +178,7 @@ def test_fixed_temperature_and_own_temperature_rate() -> None:
 def test_what_is_compiled_is_not_pickled() -> None:
     level = make_level()
     level.train(1, 16)
-    level._update._steps[16] = lambda *args: None
+    level._update._steps[16, 0] = lambda *args: None
     assert pickle.loads(pickle.dumps(level._update.__getstate__()["_steps"])) == {}
 
 

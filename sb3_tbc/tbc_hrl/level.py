@@ -177,8 +177,8 @@ class SACLevel(SAC):
             steps = min(BURST, gradient_steps - start)
             for key, value in self._run(steps, batch_size).items():
                 sums[key] = sums.get(key, 0.0) + steps * value
+            self.policy.after_updates(steps)
         self._n_updates += gradient_steps
-        self.refresh()
         self._check_finite()
         for key, total in sums.items():
             self.logger.record(self.log_prefix + key, total / gradient_steps)
@@ -228,7 +228,7 @@ class SACLevel(SAC):
 
     def refresh(self) -> None:
         """Make the next :meth:`act` read the weights again; needed after changing them by hand."""
-        self.policy.weights_version += 1
+        self.policy.after_updates(0)
 
     def act(
         self,

@@ -73,6 +73,7 @@ class MLPActor(Actor):
     """
 
     state_dim = 0
+    sub_steps = 0
 
     def __init__(
         self,
@@ -158,7 +159,6 @@ class NDBCActor(BasePolicy):
         self.ndbc = dict(ndbc)
         wiring = NDBCWiring(features_dim, **{k: v for k, v in self.ndbc.items() if k in WIRING_KEYS})
         options = {k: v for k, v in self.ndbc.items() if k not in WIRING_KEYS}
-        options.setdefault("seed", int(th.randint(2**31, ())))  # follows the run's seed, as the MLP's weights do
         self.net = NDBCNet(features_dim, 2 * get_action_dim(action_space), wiring, **options)
         self.state_dim = int(self.net.state_dim)
         self.head = GaussianHead(mean_bound, log_std_bounds)
@@ -172,6 +172,11 @@ class NDBCActor(BasePolicy):
         """One control step: mean and log_std ``(batch, action_dim)`` and membrane potentials ``(batch, state_dim)``."""
         outputs, next_state = self.net(obs, state)
         return *self.head(outputs), next_state
+
+    @property
+    def sub_steps(self) -> int:
+        """Sub-steps of a control step, K; the circuit's step-size rule may change it between bursts of updates."""
+        return self.net.sub_steps
 
     def blocks(self) -> list[Block]:
         """One block per parameter of the circuit."""
@@ -308,8 +313,21 @@ class LevelPolicy(SACPolicy):
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """Load weights in place, see torch."""
         result = super().load_state_dict(*args, **kwargs)
-        self.weights_version += 1
+        if isinstance(self.actor, NDBCActor):
+            self.actor.net.refresh_step()
+        self._weights_changed()
         return result
+
+    def after_updates(self, n_updates: int) -> None:
+        """Bring up to date what depends on the weights, after they were updated ``n_updates`` times."""
+        if isinstance(self.actor, NDBCActor):
+            self.actor.net.after_update(n_updates)
+        self._weights_changed()
+
+    def _weights_changed(self) -> None:
+        if isinstance(self.actor, NDBCActor) and isinstance(self.average_actor, NDBCActor):
+            self.average_actor.net.sub_steps = self.actor.net.sub_steps
+        self.weights_version += 1
 
     def make_actor(self, features_extractor: Any = None) -> MLPActor | NDBCActor:  # type: ignore[override]
         """Build the actor that ``ndbc`` asks for."""

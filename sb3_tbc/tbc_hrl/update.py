@@ -144,7 +144,7 @@ class SACUpdate:
         self.ent_coef_optimizer = ent_coef_optimizer
         self.action_dim = math.prod(policy.action_space.shape or (1,))
         self.compile = compile
-        self._steps: dict[int, Callable[..., None]] = {}
+        self._steps: dict[tuple[int, int], Callable[..., None]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_steps": {}}
@@ -235,9 +235,11 @@ class SACUpdate:
         return th.from_numpy(table)
 
     def _step_for(self, batch_size: int, example: list[th.Tensor]) -> Callable[..., None]:
-        if batch_size not in self._steps:
-            self._steps[batch_size] = compile_step(self._step, example, self.compile)
-        return self._steps[batch_size]
+        """The step for a batch size and the circuit's present number of sub-steps, compiled when first asked for."""
+        key = (batch_size, self.policy.actor.sub_steps)
+        if key not in self._steps:
+            self._steps[key] = compile_step(self._step, example, self.compile)
+        return self._steps[key]
 
     def _step(self, stats: th.Tensor, ent: th.Tensor, *tensors: th.Tensor) -> None:
         """One update; the tensors of :meth:`_state`, ``stats`` and ``ent`` are changed in place."""
