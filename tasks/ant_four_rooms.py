@@ -11,6 +11,7 @@ import numpy as np
 from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
+from .mujoco_rendering import ASSETS, GOAL_RGBA, SUBGOAL_RGBA, Scene
 from .mujoco_task import MujocoTask
 
 ROOM_SIGNS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
@@ -36,19 +37,17 @@ LEGS = (  # name, sign x, sign y, ankle axis, ankle range
 )
 
 
-def ant_xml(extra: str = "") -> str:
-    """The model: ant, floor and walls.
-
-    :param extra: further elements for the world body (markers for drawing)
-    """
+def ant_xml() -> str:
+    """The model: ant, floor and walls."""
     legs = "".join(_leg(k + 1, *leg) for k, leg in enumerate(LEGS))
     walls = "".join(
-        f'<body name="{name}" pos="{x} {y} 1"><geom type="box" size="{hx} {hy} 1" contype="1" conaffinity="1"/></body>'
+        f'<body name="{name}" pos="{x} {y} 1">'
+        f'<geom type="box" size="{hx} {hy} 1" conaffinity="1" material="wall"/></body>'
         for name, (x, y, hx, hy) in WALLS.items()
     )
     motors = "".join(f'<motor joint="{joint}_{k}"/>' for k in (4, 1, 2, 3) for joint in ("hip", "ankle"))
     return f"""
-<mujoco model="ant_four_rooms">
+<mujoco model="ant_four_rooms">{ASSETS}
   <compiler angle="degree" inertiafromgeom="true" autolimits="true"/>
   <option timestep="0.02" integrator="RK4"/>
   <size njmax="500" nconmax="200"/>
@@ -58,11 +57,12 @@ def ant_xml(extra: str = "") -> str:
     <motor ctrllimited="true" ctrlrange="-1 1" gear="15"/>
   </default>
   <worldbody>
-    <geom name="floor" type="plane" size="40 40 40" conaffinity="1"/>
+    <light pos="0 0 20" dir="0.2 0.15 -1" directional="true" diffuse="0.5 0.5 0.5"/>
+    <geom name="floor" type="plane" size="40 40 40" conaffinity="1" material="tiles"/>
     <body name="torso" pos="0 0 0.75">
-      <geom type="sphere" size="0.25"/>
+      <geom type="sphere" size="0.25" material="body"/>
       <joint name="root" type="free" armature="0" damping="0" margin="0.01" limited="false"/>{legs}
-    </body>{walls}{extra}
+    </body>{walls}
   </worldbody>
   <actuator>{motors}</actuator>
 </mujoco>
@@ -71,14 +71,14 @@ def ant_xml(extra: str = "") -> str:
 
 def _leg(k: int, name: str, sx: int, sy: int, axis: str, span: str) -> str:
     near, far = f"{0.2 * sx} {0.2 * sy} 0", f"{0.4 * sx} {0.4 * sy} 0"
-    link = f'<geom type="capsule" size="0.08" fromto="0 0 0 {near}"/>'
+    link = f'<geom type="capsule" size="0.08" fromto="0 0 0 {near}" material="joint"/>'
     return f"""
       <body name="{name}">{link}
         <body name="aux_{k}" pos="{near}">
           <joint name="hip_{k}" axis="0 0 1" range="-30 30"/>{link}
           <body name="shin_{k}" pos="{near}">
             <joint name="ankle_{k}" axis="{axis}" range="{span}"/>
-            <geom type="capsule" size="0.08" fromto="0 0 0 {far}"/>
+            <geom type="capsule" size="0.08" fromto="0 0 0 {far}" material="body"/>
           </body>
         </body>
       </body>"""
@@ -157,6 +157,18 @@ class AntFourRooms(MujocoTask):
         mujoco.mj_rnePostConstraint(self.model, self.data)
         wrenches = np.clip(self.data.cfrc_ext[:14], -1.0, 1.0)
         return np.concatenate([self._qpos[2:], self._qvel, wrenches.ravel()]), achieved
+
+    def _make_scene(self) -> Scene:
+        return Scene(self.model, (640, 640), lookat=(0.0, 0.3, 0.0), distance=25.0, azimuth=90.0, elevation=-75.0)
+
+    def _add_markers(self, scene: Scene) -> None:
+        scene.add_geom(mujoco.mjtGeom.mjGEOM_BOX, self.goal_tolerance, self._goal, GOAL_RGBA)
+        subgoal = self._overlay[0]
+        if subgoal is None:
+            return
+        scene.add_geom(mujoco.mjtGeom.mjGEOM_SPHERE, (0.35, 0.35, 0.35), subgoal[:3], SUBGOAL_RGBA)
+        if not self.legacy_quirks:
+            scene.add_arrow(subgoal[:3], (*subgoal[3:], 0.0), SUBGOAL_RGBA, 0.1)
 
 
 def _compact_local(observation: GoalObservation) -> FloatArray:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array, GoalTask
+from .drawing import draw_drawbridge
 from .history import FrameHistory
 
 LENGTH = 10.0
@@ -107,7 +108,9 @@ class Drawbridge(GoalTask):
         }
 
     def _draw(self) -> NDArray[np.uint8]:
-        raise NotImplementedError
+        return draw_drawbridge(
+            self._position, self._speed, self._sails, self._angle, self._goal_list[0], self._overlay, self._elapsed
+        )
 
 
 def _compact_local(observation: GoalObservation) -> FloatArray:

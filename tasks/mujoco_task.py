@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Array, GoalTask
+from .mujoco_rendering import Scene
+from .rendering import Canvas
 
 
 class MujocoTask(GoalTask):
@@ -32,6 +34,7 @@ class MujocoTask(GoalTask):
         self._qpos: Array = self.data.qpos
         self._qvel: Array = self.data.qvel
         self._ctrl: Array = self.data.ctrl
+        self._scene: Scene | None = None
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
 
     @abstractmethod
@@ -57,5 +60,31 @@ class MujocoTask(GoalTask):
         """``qpos`` and ``qvel`` of the model."""
         return {"qpos": self._qpos.copy(), "qvel": self._qvel.copy()}
 
-    def _draw(self) -> NDArray[np.uint8]:
+    # -- pictures --------------------------------------------------------------------------------------------------
+
+    def _make_scene(self) -> Scene:
+        """The camera on this task."""
         raise NotImplementedError
+
+    def _add_markers(self, scene: Scene) -> None:
+        """Add goal, subgoal and what else helps to the scene."""
+
+    def _draw(self) -> NDArray[np.uint8]:
+        if self._scene is None:
+            self._scene, self._drawn = self._make_scene(), mujoco.MjData(self.model)
+        # Drawing works on a copy, because kinematics on the simulator's own data would change what a step returns.
+        self._drawn.qpos[:] = self._qpos
+        mujoco.mj_kinematics(self.model, self._drawn)
+        self._scene.update(self._drawn)
+        self._add_markers(self._scene)
+        canvas = Canvas.over(self._scene.picture())
+        subgoal, time_left, text = self._overlay
+        canvas.overlay(f"{type(self).__name__}  step {self._elapsed}", time_left, text, subgoal is not None)
+        return canvas.pixels
+
+    def close(self) -> None:
+        """Close the window and free the OpenGL context."""
+        super().close()
+        if self._scene is not None:
+            self._scene.close()
+            self._scene = None

@@ -13,6 +13,7 @@ from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array, GoalTask
 from .box2d import box_fixture, circle_fixture, load_box2d
+from .drawing import draw_platforms
 from .history import FrameHistory
 
 DT = 1.0 / 60.0
@@ -180,7 +181,7 @@ class Platforms(GoalTask):
         }
 
     def _draw(self) -> NDArray[np.uint8]:
-        raise NotImplementedError
+        return draw_platforms(self.task_state(), STATIC, self._goal, self._overlay)
 
 
 def _compact_local(observation: GoalObservation) -> FloatArray:

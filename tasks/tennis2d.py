@@ -13,7 +13,8 @@ from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array, GoalTask
 from .box2d import load_box2d
-from .tennis2d_world import TennisWorld, clip_unit
+from .drawing import draw_tennis
+from .tennis2d_world import RACKET_HALF, ROD_HALF, TennisWorld, clip_unit
 
 DT = 0.01
 LENGTH_SCALE, SPEED_SCALE, SPIN_SCALE = 6.0, 5.4, 5.0
@@ -163,7 +164,8 @@ class Tennis2D(GoalTask):
         return state
 
     def _draw(self) -> NDArray[np.uint8]:
-        raise NotImplementedError
+        halves = (ROD_HALF, ROD_HALF, RACKET_HALF)
+        return draw_tennis(self.task_state(), halves, self._goal, self._overlay, self._elapsed)
 
 
 def _robot(observation: GoalObservation) -> FloatArray:

@@ -121,13 +121,13 @@ class UR5Reacher(MujocoTask):
         return self._history.reset(frame) if first else self._history.push(frame), achieved
 
     def _make_scene(self) -> Scene:
-        return Scene(self.model, (640, 480), lookat=(0.0, 0.0, 0.3), distance=2.6, azimuth=150.0, elevation=-22.0)
+        return Scene(self.model, (640, 480), lookat=(0.0, 0.0, 0.32), distance=2.3, azimuth=150.0, elevation=-25.0)
 
     def _add_markers(self, scene: Scene) -> None:
-        scene.add_ghost(self._goal, GOAL_RGBA)
-        subgoal = self._overlay[0]
-        if subgoal is not None:
-            scene.add_ghost(subgoal[:3], SUBGOAL_RGBA)
+        shoulder = np.flatnonzero(self.model.geom_bodyid == self.model.body("shoulder_link").id)
+        for ghost, rgba in ((self._goal, GOAL_RGBA), (self._overlay[0], SUBGOAL_RGBA)):
+            if ghost is not None:
+                scene.add_ghost(ghost[:3], rgba, without=shoulder.tolist())
 
 
 def describe_arm(n_frames: int) -> tuple[Array, Array, SubgoalSpace]:

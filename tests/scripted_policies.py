@@ -16,7 +16,7 @@ def sail_late(start=254):
 
 
 def servo(observation):
-    """UR5Reacher: proportional joint velocity, twice the wish because damping halves it, plus a share against gravity."""
+    """UR5Reacher: a velocity command proportional to the error, plus a share against gravity."""
     state = observation["observation"]
     error = observation["desired_goal"] - state[:3]
     lift, elbow = state[1], state[2]

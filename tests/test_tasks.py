@@ -314,7 +314,8 @@ def test_start_distributions():
 
 def test_importing_the_package_stays_light():
     code = (
-        "import sys, sb3_tbc.tasks; heavy = {'mujoco', 'Box2D', 'pybullet', 'matplotlib', 'imageio', 'gymnasium_robotics'};"
+        "import sys, sb3_tbc.tasks;"
+        "heavy = {'mujoco', 'Box2D', 'pybullet', 'matplotlib', 'imageio', 'gymnasium_robotics'};"
         "print(sorted(heavy & set(sys.modules)))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

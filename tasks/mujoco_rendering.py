@@ -1,0 +1,147 @@
+"""Off-screen pictures of MuJoCo tasks, with ghosts and markers of goals; needs EGL, OSMesa or a display."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+GOAL_RGBA = (0.13, 0.59, 0.33, 0.45)
+SUBGOAL_RGBA = (0.90, 0.47, 0.08, 0.55)
+
+ASSETS = """
+  <visual>
+    <headlight ambient="0.6 0.6 0.6" diffuse="0.25 0.25 0.25" specular="0.1 0.1 0.1"/>
+    <quality offsamples="4"/>
+    <map znear="0.01"/>
+  </visual>
+  <asset>
+    <texture type="skybox" builtin="gradient" rgb1="0.98 0.98 0.97" rgb2="0.80 0.85 0.90" width="64" height="384"/>
+    <texture name="tiles" type="2d" builtin="checker" rgb1=".93 .93 .92" rgb2=".86 .87 .88" width="64" height="64"/>
+    <material name="tiles" texture="tiles" texrepeat="1 1" texuniform="true" specular="0"/>
+    <material name="wall" rgba="0.68 0.70 0.74 1"/>
+    <material name="body" rgba="0.15 0.40 0.68 1" specular="0.4" shininess="0.5"/>
+    <material name="joint" rgba="0.17 0.19 0.23 1" specular="0.4" shininess="0.5"/>
+  </asset>
+"""
+"""Lights and colours for a model; they do not touch its physics."""
+
+
+class GLUnavailable(RuntimeError):
+    """No way to draw with OpenGL; the message says what to install."""
+
+
+def _open_context(width: int, height: int) -> Any:
+    """The first OpenGL context that works: the one named by MUJOCO_GL, or EGL, OSMesa, GLFW in this order."""
+    named = os.environ.get("MUJOCO_GL", "").lower().strip()
+    kinds = [named] if named in ("egl", "osmesa", "glfw", "cgl") else ["egl", "osmesa", "glfw"]
+    failures = []
+    for kind in kinds:
+        try:
+            context = import_module(f"mujoco.{kind}").GLContext(width, height)
+            context.make_current()
+        except Exception as error:  # Each backend fails with errors of its own library.
+            failures.append(f"{kind}: {type(error).__name__}: {error}".splitlines()[0])
+        else:
+            return context
+    raise GLUnavailable(
+        "Drawing this task needs OpenGL, and no backend works here. Install one, e.g. `apt-get install libegl1 "
+        "libgl1-mesa-dri` (EGL) or `apt-get install libosmesa6` (software, with MUJOCO_GL=osmesa set before Python "
+        f"starts). Tried {'; '.join(failures)}"
+    )
+
+
+class Scene:
+    """Draws a model from a fixed camera.
+
+    :param model: the task's model
+    :param size: width and height, pixels
+    :param lookat: the point in the middle of the picture
+    :param distance: of the camera from it, metres
+    :param azimuth: degrees
+    :param elevation: degrees, negative looks down
+    :raises GLUnavailable: without OpenGL
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        size: tuple[int, int],
+        lookat: Sequence[float],
+        distance: float,
+        azimuth: float,
+        elevation: float,
+    ) -> None:
+        self._model, (width, height) = model, size
+        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
+        self._gl = _open_context(width, height)
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
+        self._viewport = mujoco.MjrRect(0, 0, width, height)
+        self.scene = mujoco.MjvScene(model, maxgeom=400)
+        # Without a graphics card shadows take five times as long as all the rest.
+        self.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW.value] = 0
+        self._camera = mujoco.MjvCamera()
+        self._camera.lookat[:] = lookat
+        self._camera.distance, self._camera.azimuth, self._camera.elevation = distance, azimuth, elevation
+        self._option, self._perturb = mujoco.MjvOption(), mujoco.MjvPerturb()
+        self._ghost_data = mujoco.MjData(model)
+
+    def update(self, data: mujoco.MjData) -> None:
+        """Take over the present poses; forgets ghosts and markers."""
+        everything = mujoco.mjtCatBit.mjCAT_ALL.value
+        mujoco.mjv_updateScene(self._model, data, self._option, self._perturb, self._camera, everything, self.scene)
+
+    def add_ghost(self, qpos: ArrayLike, rgba: Sequence[float], without: Sequence[int] = ()) -> None:
+        """Add the moving bodies in another configuration, in one translucent colour.
+
+        :param without: geoms to leave out, because they would coincide with the real ones
+        """
+        ghost, first = self._ghost_data, self.scene.ngeom
+        ghost.qpos[:] = qpos
+        mujoco.mj_kinematics(self._model, ghost)
+        dynamic = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+        mujoco.mjv_addGeoms(self._model, ghost, self._option, self._perturb, dynamic, self.scene)
+        for geom in self.scene.geoms[first : self.scene.ngeom]:
+            geom.rgba[:] = (0.0, 0.0, 0.0, 0.0) if geom.objid in without else rgba
+            geom.matid = -1
+
+    def add_geom(self, kind: Any, size: ArrayLike, position: ArrayLike, rgba: Sequence[float]) -> None:
+        """Add a free-standing shape (a ``mujoco.mjtGeom``) of half-sizes ``size``."""
+        geom = self._next_geom()
+        mujoco.mjv_initGeom(
+            geom, kind.value, np.array(size, float), np.array(position, float), np.eye(3).ravel(), np.array(rgba, "f4")
+        )
+
+    def add_arrow(self, start: ArrayLike, vector: ArrayLike, rgba: Sequence[float], width: float = 0.05) -> None:
+        """Add an arrow from ``start`` along ``vector``; nothing if it is too short to see."""
+        begin, along = np.array(start, float), np.array(vector, float)
+        if np.linalg.norm(along) < width:
+            return
+        geom, arrow = self._next_geom(), mujoco.mjtGeom.mjGEOM_ARROW.value
+        mujoco.mjv_initGeom(geom, arrow, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, "f4"))
+        mujoco.mjv_connector(geom, arrow, width, begin, begin + along)
+
+    def _next_geom(self) -> Any:
+        self.scene.ngeom += 1
+        return self.scene.geoms[self.scene.ngeom - 1]
+
+    def picture(self) -> NDArray[np.uint8]:
+        """Render, ``(height, width, 3)``."""
+        self._gl.make_current()
+        mujoco.mjr_render(self._viewport, self.scene, self._context)
+        pixels = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
+        return np.ascontiguousarray(pixels[::-1])
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        if self._gl is not None:
+            self._context.free()
+            self._gl.free()
+            self._gl = None

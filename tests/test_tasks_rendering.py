@@ -1,0 +1,156 @@
+"""Pictures of the tasks: shape, overlay, the canvas itself, and what is said where drawing is impossible."""
+
+import importlib
+import sys
+import types
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from sb3_tbc.tasks import mujoco_rendering
+from sb3_tbc.tasks.rendering import BODY, GOAL, PAPER, SUBGOAL, Canvas
+from sb3_tbc.tasks.window import Window
+
+import sb3_tbc  # noqa: F401  (registers the tasks)
+
+PLANAR = ["Pendulum", "Drawbridge", "Platforms", "Tennis2D"]
+SPATIAL = ["UR5Reacher", "AntFourRooms"]
+
+
+def render(task, **overlay):
+    env = gym.make(f"sb3_tbc/{task}-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(np.zeros(env.action_space.shape))
+    state = env.unwrapped.task_state()
+    env.unwrapped.set_overlay(**overlay)
+    try:
+        picture = env.render()
+    except mujoco_rendering.GLUnavailable as error:
+        pytest.skip(str(error))
+    assert all(np.array_equal(state[key], value, equal_nan=True) for key, value in env.unwrapped.task_state().items())
+    env.close()
+    return picture
+
+
+def count(picture, color, tolerance=12):
+    return int((np.abs(picture.astype(int) - np.array(color)).max(axis=-1) <= tolerance).sum())
+
+
+@pytest.mark.parametrize("task", PLANAR + SPATIAL)
+def test_picture_shows_subgoal_and_time(task):
+    bare = render(task)
+    assert bare.dtype == np.uint8
+    assert bare.ndim == 3
+    assert bare.shape[2] == 3
+    assert len(np.unique(bare.reshape(-1, 3), axis=0)) > 5
+    assert count(bare, GOAL) > 100
+    assert count(bare, SUBGOAL) == 0
+    space = gym.make(f"sb3_tbc/{task}-v0").unwrapped.subgoals
+    subgoal = space.unscale(np.full(space.dim, 0.5))
+    full, late = render(task, subgoal=subgoal, time_left=1.0), render(task, subgoal=subgoal, time_left=0.1)
+    ring = slice(0, 64), slice(bare.shape[1] - 64, None)
+    assert count(full[ring], SUBGOAL) > 3 * count(late[ring], SUBGOAL) > 0
+    changed = (full.astype(int) - bare).any(axis=-1)
+    assert changed[80:].any()  # the subgoal itself, below legend and ring
+
+
+def test_rendering_changes_nothing():
+    """Episodes with and without pictures agree to the bit."""
+    for task in [*PLANAR, "AntFourRooms"]:
+        seen, unseen = gym.make(f"sb3_tbc/{task}-v0", render_mode="rgb_array"), gym.make(f"sb3_tbc/{task}-v0")
+        seen.reset(seed=1)
+        unseen.reset(seed=1)
+        seen.action_space.seed(0)
+        for _ in range(4):
+            action = seen.action_space.sample()
+            one, other = seen.step(action)[0], unseen.step(action)[0]
+            assert np.array_equal(one["observation"], other["observation"])
+            try:
+                seen.render()
+            except mujoco_rendering.GLUnavailable:
+                break
+        seen.close()
+
+
+def test_canvas_draws_where_it_should():
+    canvas = Canvas(100, 80, -1.0, 0.0, 50.0)
+    canvas.box((0.0, 0.8), (0.2, 0.1), BODY)
+    assert count(canvas.pixels, BODY, 0) == 20 * 10
+    assert tuple(canvas.pixels[40, 50]) == BODY
+    canvas.circle((0.5, 1.3), 0.2, GOAL)
+    assert abs(count(canvas.pixels, GOAL, 0) - np.pi * 100) < 40
+    assert tuple(canvas.pixels[15, 75]) == GOAL
+    canvas.polygon([(-0.9, 0.1), (-0.5, 0.1), (-0.5, 0.5)], SUBGOAL)
+    assert tuple(canvas.pixels[72, 22]) == SUBGOAL
+    assert tuple(canvas.pixels[60, 7]) == PAPER
+    canvas.line((-5.0, -5.0), (5.0, -4.0), BODY)  # outside: nothing happens
+    canvas.text(90, 70, "cut off at the border")
+    canvas.box((10.0, 10.0), (1.0, 1.0), BODY)
+    assert canvas.pixels.shape == (80, 100, 3)
+
+
+def test_box_turned_by_nothing_equals_polygon():
+    snapped, smooth = Canvas(60, 60, 0, 0, 1.0), Canvas(60, 60, 0, 0, 1.0)
+    snapped.box((30, 30), (10, 5), BODY)
+    smooth.polygon([(20, 25), (40, 25), (40, 35), (20, 35)], BODY)
+    assert np.abs(snapped.pixels.astype(int) - smooth.pixels).max() <= 1
+
+
+def test_render_without_mode_warns_and_returns_nothing():
+    env = gym.make("sb3_tbc/Pendulum-v0")
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
+
+
+def test_missing_opengl_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(
+        mujoco_rendering, "import_module", lambda name: (_ for _ in ()).throw(ImportError(f"no {name}"))
+    )
+    env = gym.make("sb3_tbc/UR5Reacher-v0", render_mode="rgb_array")
+    env.reset(seed=0)
+    with pytest.raises(mujoco_rendering.GLUnavailable, match=r"apt-get install libegl1.*no mujoco\.egl"):
+        env.render()
+
+
+def test_human_mode_without_display_says_what_to_do(monkeypatch):
+    tk = types.ModuleType("tkinter")
+
+    def no_display():
+        raise OSError("no display name")
+
+    tk.Tk = no_display
+    monkeypatch.setitem(sys.modules, "tkinter", tk)
+    env = gym.make("sb3_tbc/Drawbridge-v0", render_mode="human")
+    with pytest.raises(RuntimeError, match="rgb_array"):
+        env.reset()
+
+
+def test_human_mode_shows_each_step(monkeypatch):
+    shown = []
+
+    class FakeTk:
+        def __init__(self, *_, **__):
+            pass
+
+        def __getattr__(self, name):
+            return lambda *_, **__: None
+
+    def photo(data, format):
+        shown.append(data[:16])
+        return object()
+
+    tk = types.ModuleType("tkinter")
+    tk.Tk = tk.Label = FakeTk
+    tk.PhotoImage = photo
+    monkeypatch.setitem(sys.modules, "tkinter", tk)
+    importlib.import_module("sb3_tbc.tasks.window")
+    env = gym.make("sb3_tbc/Drawbridge-v0", render_mode="human")
+    env.reset()
+    env.step(np.zeros(1))
+    assert len(shown) == 2
+    assert shown[0].startswith(b"P6 800 360 255\n")
+    assert env.render() is None
+    env.close()
+    assert isinstance(Window, type)
