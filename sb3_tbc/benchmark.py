@@ -1,0 +1,50 @@
+"""``python -m sb3_tbc.benchmark <what>``: timings of this package beside others, taken in turns in one run."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_tbc.callbacks import write_atomic
+from sb3_tbc.cli import Parser, positive_int, run_command
+from sb3_tbc.zoo.ledger import to_json
+
+
+def build_parser() -> Parser:
+    """The command's arguments, one sub-command per thing to measure."""
+    parser = Parser(prog="sb3_tbc.benchmark", description="Timings, one torch thread; ratios within a run count.")
+    commands = parser.add_subparsers(dest="what", required=True, parser_class=Parser)
+    cells = commands.add_parser("cells", help="NDBCNet beside LTC, CfC and GRU: sequences, single steps, growth")
+    cells.add_argument("--rounds", type=positive_int, default=20, help="rounds over all cells")
+    cells.add_argument("--batch", type=positive_int, default=256)
+    cells.add_argument("--time", type=positive_int, default=16, help="steps of a sequence")
+    cells.add_argument("--compile", action="store_true", help="also the compiled network (takes minutes to compile)")
+    cells.add_argument("--no-growth", action="store_true", help="skip the curves over synapses, time and K")
+    cells.add_argument("--json", metavar="OUT", help="write the figures here too")
+    parameters = commands.add_parser("parameters", help="parameter counts of table A1's circuits beside their MLPs")
+    parameters.add_argument("--json", metavar="OUT", help="write the figures here too")
+    return parser
+
+
+def benchmark(argv: Sequence[str]) -> int:
+    """Measure what the arguments ask for and print it."""
+    arguments = build_parser().parse_args(argv)
+    lines, figures = _measure(arguments)
+    print("\n".join(lines))
+    if arguments.json:
+        write_atomic(Path(arguments.json), to_json(figures))
+    return 0
+
+
+def _measure(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
+    from sb3_tbc import benchmark_cells
+
+    if arguments.what == "cells":
+        return benchmark_cells.cells(arguments)
+    return benchmark_cells.parameters()
+
+
+if __name__ == "__main__":
+    raise SystemExit(run_command(benchmark, "sb3_tbc.benchmark"))

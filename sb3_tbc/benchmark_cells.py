@@ -1,0 +1,266 @@
+"""What ``python -m sb3_tbc.benchmark cells`` and ``parameters`` measure."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_tbc.ndbc.closed_form import ClosedFormNDBC
+from sb3_tbc.ndbc.diagnostics import count_parameters
+from sb3_tbc.ndbc.frozen import FrozenNDBC
+from sb3_tbc.ndbc.network import NDBCNet
+from sb3_tbc.ndbc.wiring import NDBCWiring
+
+N_INPUTS, N_OUTPUTS = 10, 4
+ANT_FOUR_ROOMS = (12, 10, 8, 5, 8, 2, 6)  # table A1: the largest circuit, 30 neurons
+TABLE_A1 = {
+    "AntFourRooms": (12, 10, 8, 5, 8, 2, 6),
+    "UR5Reacher": (6, 4, 3, 4, 5, 2, 5),
+    "Drawbridge": (6, 6, 1, 3, 4, 3, 4),
+    "Tennis2D": (8, 6, 3, 4, 6, 4, 6),
+    "Pendulum": (6, 6, 1, 3, 4, 1, 4),
+    "Platforms": (6, 6, 1, 4, 5, 3, 5),
+}
+"""inter, command, motor, sensory fan-out, inter fan-out, recurrent command synapses, motor fan-in."""
+
+Job = Callable[[], Any]
+
+
+class Candidate(NamedTuple):
+    """A cell to time: its parameters, one pass over a sequence, and one step at batch 1 (None: not timed)."""
+
+    name: str
+    parameters: int
+    forward: Callable[[th.Tensor], th.Tensor] | None
+    step: Job | None
+    trained: Sequence[nn.Parameter]
+
+
+def in_turns(jobs: Mapping[str, Job], rounds: int, calls: int = 1) -> dict[str, list[float]]:
+    """Seconds per call of every job in every round; rounds go through all jobs, so that load spreads evenly."""
+    for job in jobs.values():
+        for _ in range(max(2, calls // 10)):
+            job()
+    seconds: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(rounds):
+        for name, job in jobs.items():
+            start = time.perf_counter()
+            for _ in range(calls):
+                job()
+            seconds[name].append((time.perf_counter() - start) / calls)
+    return seconds
+
+
+def ratio(seconds: Mapping[str, list[float]], name: str, reference: str) -> float:
+    """Median over rounds of ``name`` against ``reference`` in the same round."""
+    return statistics.median(a / b for a, b in zip(seconds[name], seconds[reference], strict=True))
+
+
+def ndbc_candidate(sub_steps: int, dynamics: str = "conductance", compiled: bool = False) -> Candidate:
+    """The 30-neuron circuit of table A1's AntFourRooms."""
+    wiring = NDBCWiring(N_INPUTS, *ANT_FOUR_ROOMS)
+    net = NDBCNet(N_INPUTS, N_OUTPUTS, wiring, sub_steps=sub_steps, dynamics=dynamics, seed=0)
+    frozen = FrozenNDBC(net)
+    x, state = np.zeros((1, N_INPUTS), np.float32), np.zeros((1, net.state_dim), np.float32)
+    run: Callable[..., Any] = th.compile(net, fullgraph=True, dynamic=False) if compiled else net
+    label = f"NDBC K={sub_steps}" + (" dissipative" if dynamics != "conductance" else "")
+    return Candidate(
+        label + (" compiled" if compiled else ""), _count(net), _first(run),
+        None if compiled else lambda: frozen(x, state), list(net.parameters()),
+    )  # fmt: skip
+
+
+def closed_form_candidate() -> Candidate:
+    """The same circuit through its closed form, NumPy, acting only."""
+    net = NDBCNet(N_INPUTS, N_OUTPUTS, NDBCWiring(N_INPUTS, *ANT_FOUR_ROOMS), seed=0)
+    closed = ClosedFormNDBC(net)
+    x, state = np.zeros((1, N_INPUTS), np.float32), np.zeros((1, net.state_dim), np.float32)
+    return Candidate("NDBC closed form", _count(net), None, lambda: closed(x, state), [])
+
+
+def gru_candidate() -> Candidate:
+    """A GRU of torch with 32 units and a linear readout."""
+    gru, readout = nn.GRU(N_INPUTS, 32, batch_first=True), nn.Linear(32, N_OUTPUTS)
+    x, state = th.zeros(1, 1, N_INPUTS), th.zeros(1, 1, 32)
+
+    @th.no_grad()
+    def step() -> th.Tensor:
+        result: th.Tensor = readout(gru(x, state)[0])
+        return result
+
+    return Candidate(
+        "GRU(32)", _count(gru) + _count(readout), lambda inputs: readout(gru(inputs)[0]), step,
+        [*gru.parameters(), *readout.parameters()],
+    )  # fmt: skip
+
+
+def ncps_candidates() -> list[Candidate]:
+    """Wired LTC of ncps (6 unfolds) and CfC with 30 units; none where ncps is not installed."""
+    if find_spec("ncps") is None:
+        return []
+    from ncps.torch import LTC, CfC
+    from ncps.wirings import AutoNCP
+
+    candidates = []
+    for name, cell in (("ncps LTC, 6 unfolds", LTC), ("ncps CfC, wired", CfC)):
+        net = cell(N_INPUTS, AutoNCP(30, N_OUTPUTS, seed=0), batch_first=True)
+        x, state = th.zeros(1, 1, N_INPUTS), th.zeros(1, 30)
+
+        @th.no_grad()
+        def step(net: nn.Module = net, x: th.Tensor = x, state: th.Tensor = state) -> Any:
+            return net(x, state)
+
+        trained = [p for p in net.parameters() if p.requires_grad]
+        candidates.append(Candidate(name, sum(p.numel() for p in trained), _first(net), step, trained))
+    return candidates
+
+
+def cells(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
+    """Time all cells; lines to print, and the figures."""
+    th.set_num_threads(1)
+    candidates = [ndbc_candidate(k) for k in (1, 3, 6)]
+    candidates += [ndbc_candidate(3, "dissipative"), closed_form_candidate(), gru_candidate(), *ncps_candidates()]
+    if arguments.compile:
+        candidates.append(ndbc_candidate(3, compiled=True))
+    inputs = th.randn(arguments.batch, arguments.time, N_INPUTS)
+    trainable = [c for c in candidates if c.forward]
+    forward = in_turns({c.name: _forward(c, inputs) for c in trainable}, arguments.rounds)
+    both = in_turns({c.name: _forward_backward(c, inputs) for c in trainable}, arguments.rounds)
+    step = in_turns({c.name: c.step for c in candidates if c.step}, arguments.rounds, calls=200)
+    rows = [_row(c, forward, both, step) for c in candidates]
+    lines = [
+        f"batch {arguments.batch}, {arguments.time} steps, {N_INPUTS} inputs, {N_OUTPUTS} outputs, one torch thread; "
+        f"medians of {arguments.rounds} rounds in turns",
+        *_table(rows),
+    ]
+    figures: dict[str, Any] = {"cells": rows}
+    if "ncps LTC, 6 unfolds" in both:
+        figures["ltc_against_ndbc_k3"] = ratio(both, "ncps LTC, 6 unfolds", "NDBC K=3")
+        lines += ["", f"LTC with 6 unfolds takes {figures['ltc_against_ndbc_k3']:.1f} times as long as NDBC, K = 3."]
+    if not arguments.no_growth:
+        more, figures["growth"] = growth(arguments.batch, max(3, arguments.rounds // 4))
+        lines += ["", *more]
+    return lines, figures
+
+
+Seconds = Mapping[str, list[float]]
+
+
+def _row(candidate: Candidate, forward: Seconds, both: Seconds, step: Seconds) -> dict[str, Any]:
+    name = candidate.name
+    row: dict[str, Any] = {"cell": name, "parameters": candidate.parameters}
+    if name in both:
+        row["forward_ms"] = 1e3 * statistics.median(forward[name])
+        row["both_ms"] = 1e3 * statistics.median(both[name])
+        row["against_gru"] = ratio(both, name, "GRU(32)")
+    if name in step:
+        row["step_us"] = 1e6 * statistics.median(step[name])
+    return row
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The rows as a Markdown table."""
+    columns = {"forward_ms": 2, "both_ms": 2, "against_gru": 2, "step_us": 1}
+    lines = [
+        "",
+        "| cell | parameters | forward, ms | forward + backward, ms | against GRU(32) | one step, batch 1, us |",
+        "|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        figures = [f"{row[name]:.{digits}f}" if name in row else "-" for name, digits in columns.items()]
+        lines.append(f"| {row['cell']} | {row['parameters']} | {' | '.join(figures)} |")
+    return lines
+
+
+def growth(batch: int, rounds: int) -> tuple[list[str], dict[str, Any]]:
+    """Forward + backward over K, over time, and over synapses, each with a straight line fitted."""
+    eight = th.randn(batch, 8, N_INPUTS)
+    jobs: dict[str, dict[int, Job]] = {
+        "K": {k: _forward_backward(ndbc_candidate(k), eight) for k in (1, 2, 3, 4, 6, 8)},
+        "time": {t: _forward_backward(ndbc_candidate(3), th.randn(batch, t, N_INPUTS)) for t in (4, 8, 16, 32)},
+        "synapses": {},
+    }
+    for size in (1, 2, 4, 8):
+        wiring = NDBCWiring(N_INPUTS, 6 * size, 6 * size, size, 3 * size, 4, 1, 4)
+        net = NDBCNet(N_INPUTS, N_OUTPUTS, wiring, seed=0)
+        candidate = Candidate("", 0, _first(net), None, list(net.parameters()))
+        jobs["synapses"][wiring.n_synapses] = _forward_backward(candidate, eight)
+    lines = ["Growth of forward + backward, ms (a straight line explains the share R2 of the variance):", ""]
+    figures: dict[str, Any] = {}
+    for what, parts in jobs.items():
+        seconds = in_turns({str(size): job for size, job in parts.items()}, rounds)
+        sizes = np.array(list(parts), dtype=float)
+        times = np.array([1e3 * statistics.median(seconds[str(size)]) for size in parts])
+        rest = times - np.polyval(np.polyfit(sizes, times, 1), sizes)
+        r2 = 1.0 - float((rest**2).sum() / ((times - times.mean()) ** 2).sum())
+        figures[what] = {"sizes": sizes.tolist(), "ms": times.tolist(), "r2": r2}
+        pairs = ", ".join(f"{size:g}: {ms:.2f}" for size, ms in zip(sizes, times, strict=True))
+        lines.append(f"* {what}: {pairs} (R2 {r2:.3f})")
+    return lines, figures
+
+
+def parameters() -> tuple[list[str], dict[str, Any]]:
+    """Table A1's circuits as SAC actors of the low level, beside the MLP of the task's configuration."""
+    import gymnasium as gym
+
+    import sb3_tbc.tasks
+    from sb3_tbc.zoo.config import load_config
+
+    sb3_tbc.tasks.register_tasks()
+    lines = [
+        "| task | neurons | synapses | NDBC actor | MLP it replaces | MLP actor | share |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    rows = []
+    for task, numbers in TABLE_A1.items():
+        env = gym.make(f"sb3_tbc/{task}-v0")
+        subgoals = env.unwrapped.subgoals  # type: ignore[attr-defined]
+        n_inputs, n_actions = subgoals.local_dim + subgoals.dim + 1, env.action_space.shape[0]  # type: ignore[index]
+        hidden = load_config("hits", task).model["low"]["policy_kwargs"]["net_arch"]
+        net = NDBCNet(n_inputs, 2 * n_actions, NDBCWiring(n_inputs, *numbers), seed=0)
+        count = count_parameters(net, hidden)
+        rows.append({"task": task, "hidden": hidden, **count._asdict(), "share": count.ratio})
+        widths = "x".join(str(h) for h in hidden)
+        lines.append(
+            f"| {task} | {count.neurons} | {count.synapses} | {count.ndbc} | {widths} | {count.mlp} | {count.ratio:.1%} |"
+        )
+    return lines, {"parameters": rows}
+
+
+def _first(network: Callable[[th.Tensor], Any]) -> Callable[[th.Tensor], th.Tensor]:
+    """The network without the state it returns."""
+
+    def run(inputs: th.Tensor) -> th.Tensor:
+        outputs: th.Tensor = network(inputs)[0]
+        return outputs
+
+    return run
+
+
+def _count(module: nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def _forward(candidate: Candidate, inputs: th.Tensor) -> Job:
+    @th.no_grad()
+    def job() -> None:
+        candidate.forward(inputs)  # type: ignore[misc]
+
+    return job
+
+
+def _forward_backward(candidate: Candidate, inputs: th.Tensor) -> Job:
+    def job() -> None:
+        for parameter in candidate.trained:
+            parameter.grad = None
+        candidate.forward(inputs).square().mean().backward()  # type: ignore[misc]
+
+    return job
