@@ -30,7 +30,6 @@ def episode_frames(model: TBCHRL, env: gym.Env[Any, Any], seed: int | None = Non
     observation, _ = env.reset(seed=seed)
     state, start, over, result = None, np.array([True]), False, "time limit"
     overlay = getattr(env.unwrapped, "set_overlay", None)
-    step = 0
     while not over:
         action, carried = model.predict(observation, state, start, deterministic=True)
         live = TwoLevelState(*carried) if carried is not None else model.policy.initial_state(1)
@@ -39,14 +38,14 @@ def episode_frames(model: TBCHRL, env: gym.Env[Any, Any], seed: int | None = Non
             break
         if overlay is not None:
             left = model.rules.remaining(live.time_budget - live.elapsed + 1)
-            overlay(live.subgoal[0], float(left[0]), f"step {step}, option {live.used[0]} of {model.max_options}")
+            overlay(live.subgoal[0], float(left[0]), f"option {live.used[0]} of {model.max_options}")
         yield _frame(env)
         observation, _, terminated, truncated, info = env.step(action)
-        state, start, step = carried, np.array([False]), step + 1
+        state, start = carried, np.array([False])
         over = terminated or truncated
         result = "success" if info.get("is_success") else result
     if overlay is not None:
-        overlay(text=f"step {step}: {result}")
+        overlay(text=result)
     yield _frame(env)
 
 
