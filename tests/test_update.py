@@ -212,8 +212,8 @@ def test_graph_passes_keep_the_numbers() -> None:
     update = level._update
     batch = level.replay_buffer.sample_burst(1, BATCH)
     noise = level_noise(level, 1)
-    row = update._schedules(1, 0.01, -2.0)[0]
-    example = [th.zeros(6), level.log_ent_coef.data, *update._state(), row, noise[0], *(x[0] for x in batch)]
+    rows = update._schedules(1, 0.01, -2.0)
+    example = [th.zeros(6), level.log_ent_coef.data, *update._state(), *(x[0] for x in (rows, noise, *batch))]
     graph = make_fx(update._step)(*(x.clone() for x in example))
     n_nodes = len(graph.graph.nodes)
     compilation.split_bias_from_products(graph)
@@ -227,6 +227,37 @@ def test_graph_passes_keep_the_numbers() -> None:
     for a, b, before in zip(ours, theirs, example, strict=True):
         assert th.allclose(a, b, atol=1e-6)
         assert not th.equal(a, before) or a.numel() == 0 or any(a is x for x in ours[-10:])
+
+
+def test_broken_toolchain(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(*args: object) -> None:
+        raise OSError("Python.h: no such file")
+
+    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    monkeypatch.setattr(compilation, "_compile", fail)
+    with caplog.at_level(logging.WARNING):
+        make_level(make_batches(), compile="auto").train(1, BATCH)
+    assert "OSError" in caplog.text
+    assert "Python.h" in caplog.text
+    with pytest.raises(OSError, match=r"Python\.h"):
+        make_level(make_batches(), compile=True).prepare(BATCH)
+
+
+def test_prepare_compiles_for_the_batch_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes = []
+    level = make_level(make_batches(), compile=True)
+    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    monkeypatch.setattr(
+        compilation, "_compile", lambda step, example: shapes.append([x.shape for x in example]) or (lambda *args: None)
+    )
+    before = level._update.actor.vector.detach().clone()
+    assert level.prepare(BATCH) >= 0.0
+    assert th.equal(before, level._update.actor.vector)
+    level.train(2, BATCH)
+    level.train(2, BATCH // 2)
+    assert len(shapes) == 2
+    assert shapes[0][-1] == (BATCH, 0)
+    assert level.compiled
 
 
 def test_unknown_compile_value() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -46,7 +47,12 @@ def compile_step(step: Callable[..., None], example: Sequence[th.Tensor], compil
         return step
     problem = compiler_problem()
     if problem is None:
-        return _compile(step, example)
+        try:
+            return _compile(step, example)
+        except Exception as error:  # whatever a half-installed toolchain brings up
+            if compile is True:
+                raise
+            problem = f"compiling failed with {type(error).__name__}: {str(error).strip().splitlines()[:1]}"
     if compile is True:
         raise RuntimeError(f"compile=True, but {problem}; install g++ or clang++, or use compile='auto' or False")
     logger.warning("updates run eagerly, about 4 times slower than compiled: %s", problem)
@@ -54,6 +60,7 @@ def compile_step(step: Callable[..., None], example: Sequence[th.Tensor], compil
 
 
 def _compile(step: Callable[..., None], example: Sequence[th.Tensor]) -> Callable[..., None]:
+    start = time.perf_counter()
     copies = [x.detach().clone() for x in example]
     graph = make_fx(step)(*copies)
     split_bias_from_products(graph)
@@ -69,6 +76,7 @@ def _compile(step: Callable[..., None], example: Sequence[th.Tensor]) -> Callabl
     else:
         options = {"config_patches": dict(INDUCTOR)}
         compiled = standalone(graph, copies, dynamic_shapes="from_example_inputs", options=options)
+    logger.info("compiled an update in %.1f s", time.perf_counter() - start)
     return compiled
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any, Protocol
 
@@ -188,14 +189,21 @@ class SACLevel(SAC):
         batch: LevelBatch = self.replay_buffer.sample_burst(gradient_steps, batch_size)  # type: ignore[union-attr]
         shape = (gradient_steps, 2, batch.rewards.shape[1], self._update.action_dim)
         noise = th.from_numpy(self.noise_rng.standard_normal(shape, dtype=np.float32))
-        fixed = self.log_ent_coef is None
         return self._update.run(
-            batch,
-            noise,
-            tau=self.tau,
-            target_entropy=float(self.target_entropy),
-            ent_coef=self.ent_coef_tensor if fixed or self.log_ent_coef is None else self.log_ent_coef,
+            batch, noise, tau=self.tau, target_entropy=float(self.target_entropy), ent_coef=self._ent_coef_state()
         )
+
+    def _ent_coef_state(self) -> th.Tensor:
+        return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef
+
+    def prepare(self, batch_size: int) -> float:
+        """Compile the update for a batch size now rather than in the first :meth:`train`.
+
+        :return: seconds it took
+        """
+        start = time.perf_counter()
+        self._update.prepare(batch_size, self._ent_coef_state())
+        return time.perf_counter() - start
 
     def _set_learning_rates(self) -> None:
         learning_rate = self.lr_schedule(self._current_progress_remaining)

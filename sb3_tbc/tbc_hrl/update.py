@@ -45,6 +45,26 @@ class Schedules(NamedTuple):
     target_entropy: th.Tensor
 
 
+class StepInputs(NamedTuple):
+    """Arguments of one update, sorted."""
+
+    stats: th.Tensor  # sums of DIAGNOSTICS
+    ent: th.Tensor  # temperature, or its logarithm when it is automatic
+    actor: th.Tensor
+    critic: th.Tensor
+    target: th.Tensor
+    average: th.Tensor
+    moments: list[tuple[th.Tensor, th.Tensor]]  # Adam's, per optimizer: actor, critic, temperature
+    constants: list[th.Tensor]
+    row: Schedules
+    noise: th.Tensor
+    batch: LevelBatch
+
+
+N_PER_STEP = 2 + len(LevelBatch._fields)
+"""Arguments that change from update to update: schedules, noise, batch."""
+
+
 class FlatParameters:
     """One vector that holds a network's parameters; the network's modules are made to share its memory.
 
@@ -100,21 +120,6 @@ def flat_adam(parameter: th.Tensor, template: th.optim.Optimizer) -> th.optim.Ad
     return adam
 
 
-def adam_(
-    options: dict[str, Any],
-    parameter: th.Tensor,
-    grad: th.Tensor,
-    moments: tuple[th.Tensor, th.Tensor],
-    step_size: th.Tensor,
-    correction: th.Tensor,
-) -> None:
-    """One step of Adam in place; bias corrections come in with ``step_size`` and ``correction``."""
-    (beta1, beta2), (mean, square) = options["betas"], moments
-    mean.lerp_(grad, 1 - beta1)
-    square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-    parameter.sub_(mean / (square.sqrt() * correction + options["eps"]) * step_size)
-
-
 def squash(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
     """Squashed Gaussian sample ``(batch, action_dim)`` and its log-probability ``(batch, 1)``, from given noise."""
     actions = th.tanh(mean + log_std.exp() * noise)
@@ -150,6 +155,11 @@ class SACUpdate:
         return {**self.__dict__, "_steps": {}}
 
     @property
+    def automatic(self) -> bool:
+        """Whether the temperature is learnt."""
+        return self.ent_coef_optimizer is not None
+
+    @property
     def compiled(self) -> bool:
         """Whether the last updates ran as a compiled graph."""
         return any(step != self._step for step in self._steps.values())
@@ -173,30 +183,39 @@ class SACUpdate:
         :param ent_coef: fixed temperature, or its logarithm when it is automatic
         :return: mean over the burst of each of :data:`DIAGNOSTICS`
         """
-        n_steps, batch_size = batch.rewards.shape[:2]
+        n_steps = len(batch.rewards)
         batch = LevelBatch(*(x.contiguous() for x in batch))
         self._check(batch, noise)
         stats = th.zeros(len(DIAGNOSTICS))
         state = [stats, ent_coef.data, *self._state()]
-        rows = self._schedules(n_steps, tau, target_entropy).unbind(0)
-        step = self._step_for(batch_size, [*state, rows[0], noise[0], *(x[0] for x in batch)])
-        for row, step_noise, *inputs in zip(rows, noise.unbind(0), *(x.unbind(0) for x in batch), strict=True):
-            step(*state, row, step_noise, *inputs)
+        rows = self._schedules(n_steps, tau, target_entropy)
+        bursts = (rows, noise, *batch)
+        step = self._step_for([*state, *(x[0] for x in bursts)])
+        for inputs in zip(*(x.unbind(0) for x in bursts), strict=True):
+            step(*state, *inputs)
         for optimizer in self.optimizers():
             self._adam_state(optimizer)["step"] += n_steps
         return dict(zip(DIAGNOSTICS, (stats / n_steps).tolist(), strict=True))
 
-    def _check(self, batch: LevelBatch, noise: th.Tensor) -> None:
-        """The compiled step trusts shapes and types, so they are checked here, once per burst."""
-        lead = tuple(batch.rewards.shape[:2])
+    def _shapes(self, n_steps: int, batch_size: int) -> dict[str, tuple[int, ...]]:
+        """Shapes of what changes from update to update, in the order of the step's arguments."""
         obs_dim, state_dim = math.prod(self.policy.observation_space.shape or ()), self.policy.actor.state_dim
         widths = (obs_dim, self.action_dim, obs_dim, 1, 1, 1, state_dim, state_dim)
-        expected = {name: (*lead, width) for name, width in zip(LevelBatch._fields, widths, strict=True)}
-        expected["noise"] = (lead[0], 2, lead[1], self.action_dim)
-        for name, x in (*batch._asdict().items(), ("noise", noise)):
-            if tuple(x.shape) != expected[name] or x.dtype != th.float32:
+        shapes: dict[str, tuple[int, ...]] = {
+            "schedules": (n_steps, len(Schedules._fields)),
+            "noise": (n_steps, 2, batch_size, self.action_dim),
+        }
+        for name, width in zip(LevelBatch._fields, widths, strict=True):
+            shapes[name] = (n_steps, batch_size, width)
+        return shapes
+
+    def _check(self, batch: LevelBatch, noise: th.Tensor) -> None:
+        """The compiled step trusts shapes and types, so they are checked here, once per burst."""
+        shapes = self._shapes(*batch.rewards.shape[:2])
+        for name, x in (("noise", noise), *batch._asdict().items()):
+            if tuple(x.shape) != shapes[name] or x.dtype != th.float32:
                 raise ValueError(
-                    f"batch.{name} must be float32 of shape {expected[name]}, got {x.dtype} {tuple(x.shape)}"
+                    f"batch.{name} must be float32 of shape {shapes[name]}, got {x.dtype} {tuple(x.shape)}"
                 )
 
     def optimizers(self) -> list[th.optim.Optimizer]:
@@ -234,54 +253,92 @@ class SACUpdate:
         table[:, 6] = target_entropy
         return th.from_numpy(table)
 
-    def _step_for(self, batch_size: int, example: list[th.Tensor]) -> Callable[..., None]:
+    def _step_for(self, example: list[th.Tensor]) -> Callable[..., None]:
         """The step for a batch size and the circuit's present number of sub-steps, compiled when first asked for."""
-        key = (batch_size, self.policy.actor.sub_steps)
+        key = (len(example[-1]), self.policy.actor.sub_steps)
         if key not in self._steps:
             self._steps[key] = compile_step(self._step, example, self.compile)
         return self._steps[key]
 
-    def _step(self, stats: th.Tensor, ent: th.Tensor, *tensors: th.Tensor) -> None:
-        """One update; the tensors of :meth:`_state`, ``stats`` and ``ent`` are changed in place."""
-        actor, critic, target, average = tensors[:4]
-        n_moments = 2 * len(self.optimizers())
-        moments, constants = tensors[4 : 4 + n_moments], tensors[4 + n_moments : -10]
-        row = Schedules(*tensors[-10].unbind())
-        noise, batch = tensors[-9], LevelBatch(*tensors[-8:])
-        policy, automatic = self.policy, self.ent_coef_optimizer is not None
+    def prepare(self, batch_size: int, ent_coef: th.Tensor) -> None:
+        """Compile for a batch size now rather than at the first update."""
+        shapes = self._shapes(1, batch_size).values()
+        example = [th.zeros(shape[1:]) for shape in shapes]
+        self._step_for([th.zeros(len(DIAGNOSTICS)), ent_coef.data, *self._state(), *example])
 
+    def _step(self, *tensors: th.Tensor) -> None:
+        """One update; everything of :class:`StepInputs` before ``constants`` is changed in place."""
+        x = self._unpack(tensors)
         with th.enable_grad():
-            actor_leaf = actor.detach().requires_grad_()
-            actor_blocks = self.actor.unflatten(actor_leaf)
-            mean, log_std, _ = policy.actor.step_blocks(actor_blocks, constants, batch.observations, batch.states)
-            actions_pi, log_prob = squash(mean, log_std, noise[0])
+            actor_leaf = x.actor.detach().requires_grad_()
+            actions_pi, log_prob = self._sample(actor_leaf, x, x.batch.observations, x.batch.states, x.noise[0])
+        ent_coef = x.ent.exp() if self.automatic else x.ent.clone()
+        surplus = (log_prob.detach() + x.row.target_entropy).mean()
+
+        target_q = self._target_q(x, ent_coef)
+        critic_loss, q_mean = self._update_critics(x, target_q)
+        actor_loss = self._update_actor(x, actor_leaf, actions_pi, log_prob, ent_coef)
+        # The temperature last, so that nothing changes while both forward passes of the actor share what they compute;
+        # the losses use its value from before the update, as in SB3.
+        ent_coef_loss = -(x.ent * surplus).sum() if self.automatic else x.ent.new_zeros(())
+        if self.automatic:
+            self._adam(2, x.ent, -surplus.expand(1), x, x.row.ent_coef_step)
+        x.target.lerp_(x.critic, x.row.tau)
+        x.average.lerp_(x.actor, x.row.average_weight)
+        diagnostics = (critic_loss, actor_loss, ent_coef_loss, ent_coef.sum(), q_mean, -log_prob.mean())
+        x.stats.add_(th.stack([value.detach() for value in diagnostics]))
+
+    def _unpack(self, tensors: Sequence[th.Tensor]) -> StepInputs:
+        stats, ent, actor, critic, target, average, *rest = tensors
+        n_moments = 2 * len(self.optimizers())
+        moments = list(zip(rest[0:n_moments:2], rest[1:n_moments:2], strict=True))
+        row, noise, *batch = rest[-N_PER_STEP:]
+        constants = rest[n_moments:-N_PER_STEP]
+        return StepInputs(
+            stats, ent, actor, critic, target, average, moments, constants,
+            Schedules(*row.unbind()), noise, LevelBatch(*batch),
+        )  # fmt: skip
+
+    def _sample(
+        self, vector: th.Tensor, x: StepInputs, obs: th.Tensor, state: th.Tensor, noise: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """Actions of the actor whose parameters are ``vector``, and their log-probabilities."""
+        mean, log_std, _ = self.policy.actor.step_blocks(self.actor.unflatten(vector), x.constants, obs, state)
+        return squash(mean, log_std, noise)
+
+    def _target_q(self, x: StepInputs, ent_coef: th.Tensor) -> th.Tensor:
+        """``r + (1 - done) discount (min Q'(s', a') - alpha log pi(a' | s'))``, ``(batch, 1)``."""
+        batch = x.batch
         with th.no_grad():
-            ent_coef = ent.exp() if automatic else ent.clone()
-            surplus = (log_prob + row.target_entropy).mean()
-            ent_coef_loss = -(ent * surplus).sum() if automatic else ent.new_zeros(())
-            blocks = self.actor.unflatten(actor)
-            mean, log_std, _ = policy.actor.step_blocks(blocks, constants, batch.next_observations, batch.next_states)
-            next_actions, next_log_prob = squash(mean, log_std, noise[1])
-            next_q = policy.critic.q_blocks(self.target.unflatten(target), batch.next_observations, next_actions)
-            next_value = next_q.amin(dim=0) - ent_coef * next_log_prob
-            target_q = batch.rewards + (1 - batch.dones) * batch.discounts * next_value
+            actions, log_prob = self._sample(x.actor, x, batch.next_observations, batch.next_states, x.noise[1])
+            q = self.policy.critic.q_blocks(self.target.unflatten(x.target), batch.next_observations, actions)
+            return batch.rewards + (1 - batch.dones) * batch.discounts * (q.amin(dim=0) - ent_coef * log_prob)
+
+    def _update_critics(self, x: StepInputs, target_q: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Step on half the summed mean squared errors; the loss and the mean Q-value before it."""
         with th.enable_grad():
-            critic_leaf = critic.detach().requires_grad_()
-            q = policy.critic.q_blocks(self.critic.unflatten(critic_leaf), batch.observations, batch.actions)
-            critic_loss = 0.5 * (q - target_q).square().mean(dim=(1, 2)).sum()
-            (critic_grad,) = th.autograd.grad(critic_loss, critic_leaf)
-        critic_options = policy.critic.optimizer.param_groups[0]
-        adam_(critic_options, critic, critic_grad, (moments[2], moments[3]), row.critic_step, row.correction)
+            leaf = x.critic.detach().requires_grad_()
+            q = self.policy.critic.q_blocks(self.critic.unflatten(leaf), x.batch.observations, x.batch.actions)
+            loss = 0.5 * (q - target_q).square().mean(dim=(1, 2)).sum()
+            (grad,) = th.autograd.grad(loss, leaf)
+        self._adam(1, x.critic, grad, x, x.row.critic_step)
+        return loss, q.mean()
+
+    def _update_actor(
+        self, x: StepInputs, leaf: th.Tensor, actions: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor
+    ) -> th.Tensor:
+        """Step on ``alpha log pi - min Q`` through the updated critics; further losses on ``actions`` belong here."""
         with th.enable_grad():
-            q_pi = policy.critic.q_blocks(self.critic.unflatten(critic), batch.observations, actions_pi)
-            actor_loss = (ent_coef * log_prob - q_pi.amin(dim=0)).mean()
-            (actor_grad,) = th.autograd.grad(actor_loss, actor_leaf)
-        actor_options = policy.actor.optimizer.param_groups[0]
-        adam_(actor_options, actor, actor_grad, (moments[0], moments[1]), row.actor_step, row.correction)
-        if automatic:  # last, so that nothing changes while both forward passes of the actor share what they compute
-            ent_options = self.optimizers()[2].param_groups[0]
-            adam_(ent_options, ent, -surplus.expand(1), (moments[4], moments[5]), row.ent_coef_step, row.correction)
-        target.lerp_(critic, row.tau)
-        average.lerp_(actor, row.average_weight)
-        diagnostics = (critic_loss, actor_loss, ent_coef_loss, ent_coef.sum(), q.mean(), -log_prob.mean())
-        stats.add_(th.stack([x.detach() for x in diagnostics]))
+            q = self.policy.critic.q_blocks(self.critic.unflatten(x.critic), x.batch.observations, actions)
+            loss = (ent_coef * log_prob - q.amin(dim=0)).mean()
+            (grad,) = th.autograd.grad(loss, leaf)
+        self._adam(0, x.actor, grad, x, x.row.actor_step)
+        return loss
+
+    def _adam(self, which: int, parameter: th.Tensor, grad: th.Tensor, x: StepInputs, step_size: th.Tensor) -> None:
+        """One step of Adam in place; the bias corrections come in with ``step_size`` and ``row.correction``."""
+        options = self.optimizers()[which].param_groups[0]
+        (beta1, beta2), (mean, square) = options["betas"], x.moments[which]
+        mean.lerp_(grad, 1 - beta1)
+        square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+        parameter.sub_(mean / (square.sqrt() * x.row.correction + options["eps"]) * step_size)
