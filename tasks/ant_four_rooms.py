@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import mujoco
@@ -124,7 +125,7 @@ class AntFourRooms(MujocoTask):
             low=-bound,
             high=bound,
             thresholds=(0.4, 0.4, 0.2, 0.8, 0.8),
-            achieved=lambda observation: _subgoal(local(observation), first),
+            achieved=functools.partial(_subgoal, local, first),
             local=local,
             local_scale=local_scale,
             names=("x", "y", "z", "ankle_4", "v_x") if self.legacy_quirks else ("x", "y", "z", "v_x", "v_y"),
@@ -179,8 +180,10 @@ def _paper_local(observation: GoalObservation) -> FloatArray:
     return np.concatenate([observation["achieved_goal"][..., :2], observation["observation"][..., :27]], axis=-1)
 
 
-def _subgoal(local: FloatArray, first_velocity: int) -> FloatArray:
-    subgoal = local[..., [0, 1, 2, first_velocity, first_velocity + 1]]
+def _subgoal(
+    local: Callable[[GoalObservation], FloatArray], first_velocity: int, observation: GoalObservation
+) -> FloatArray:
+    subgoal = local(observation)[..., [0, 1, 2, first_velocity, first_velocity + 1]]
     subgoal[..., 2] = np.minimum(subgoal[..., 2], 1.0)
     subgoal[..., 3:] = np.clip(subgoal[..., 3:], -MAX_SPEED, MAX_SPEED)
     return subgoal
