@@ -191,6 +191,24 @@ def test_policy_can_be_copied() -> None:
 
 
 @ACTORS
+def test_a_copied_level_trains_on_its_own(ndbc: dict | None) -> None:
+    level = make_level(ndbc)
+    level.train(2, 16)
+    copied = copy.deepcopy(level)
+    obs, states = inputs(level)
+    before = level.act(obs, states, True, np.random.default_rng(0))[0].copy()
+    copied.refresh()
+    assert np.array_equal(before, copied.act(obs, states, True, np.random.default_rng(0))[0])
+    level.train(3, 16)
+    copied.train(3, 16)
+    mean, _, _ = copied.actor.step(th.from_numpy(obs), th.from_numpy(states))
+    ours, theirs = (x.act(obs, states, True, np.random.default_rng(0))[0] for x in (level, copied))
+    assert np.allclose(theirs, mean.tanh().detach(), atol=1e-6)
+    assert np.array_equal(ours, theirs)
+    assert not np.allclose(before, ours)
+
+
+@ACTORS
 def test_act_is_fast(ndbc: dict | None) -> None:
     """A wide bound (loaded machines): a torch forward pass takes 60 microseconds and more."""
     level = make_level(ndbc, policy_kwargs={"net_arch": [32, 32]})

@@ -263,3 +263,21 @@ def test_prepare_compiles_for_the_batch_size(monkeypatch: pytest.MonkeyPatch) ->
 def test_unknown_compile_value() -> None:
     with pytest.raises(ValueError, match="'auto', True or False"):
         make_level(make_batches(), compile="maybe").train(1, BATCH)
+
+
+@pytest.mark.slow
+@COMPILER
+def test_compiled_circuit_agrees_with_eager() -> None:
+    circuit = {"inter": 5, "command": 4, "motor": 2, "sensory_fanout": 3, "inter_fanout": 3,
+               "recurrent_command_synapses": 3, "motor_fanin": 3}  # fmt: skip
+    levels = []
+    for compile in (False, True):
+        kwargs = {"policy_kwargs": {"net_arch": [8], "ndbc": circuit, "mean_bound": 3.0, "negative_critic": True}}
+        level = make_level(make_batches(state_dim=11), compile, **kwargs)
+        level.train(UPDATES, BATCH)
+        levels.append(level)
+    eager, compiled = (level.policy.state_dict() for level in levels)
+    assert levels[1].compiled
+    assert len(levels[1]._update._steps) == 1
+    for name, value in eager.items():
+        assert th.allclose(compiled[name], value, rtol=0, atol=1e-5), name

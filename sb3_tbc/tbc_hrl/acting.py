@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_tbc.tbc_hrl.policies import GaussianHead, LevelPolicy, MLPActor, NDBCActor
+from sb3_tbc.tbc_hrl.policies import Block, GaussianHead, LevelPolicy, MLPActor, NDBCActor
 
 FloatArray = NDArray[np.floating[Any]]
 """float32 in all that is given and returned here."""
@@ -62,11 +62,7 @@ class FrozenMLP:
 
     def refresh(self) -> None:
         """Point the arrays at the parameters again."""
-        blocks = self._actor.blocks()
-        arrays = []
-        for block in blocks:
-            start = block.parameters[0].detach()
-            arrays.append(start.as_strided(block.shape, _contiguous(block.shape)).numpy())
+        arrays = [_as_array(block) for block in self._actor.blocks()]
         self._hidden = [(w.T, b) for w, b in zip(arrays[:-2:2], arrays[1:-2:2], strict=True)]
         self._out_weight, self._out_bias = arrays[-2].T, arrays[-1]
 
@@ -81,8 +77,16 @@ class FrozenMLP:
         return np.dot(x, self._out_weight) + self._out_bias, states
 
 
-def _contiguous(shape: tuple[int, ...]) -> tuple[int, ...]:
-    return (shape[1], 1) if len(shape) == 2 else (1,)
+def _as_array(block: Block) -> FloatArray:
+    """A block of at most two dimensions as one array, without a copy if its parameters lie in flat storage."""
+    first = block.parameters[0].detach()
+    end = first.data_ptr()
+    for parameter in block.parameters:
+        if parameter.data_ptr() != end:  # a copied policy, not yet in flat storage
+            return np.concatenate([p.detach().numpy() for p in block.parameters])
+        end += parameter.numel() * parameter.element_size()
+    strides = (block.shape[1], 1) if len(block.shape) == 2 else (1,)
+    return first.as_strided(block.shape, strides).numpy()
 
 
 def freeze(actor: MLPActor | NDBCActor) -> FrozenNet:

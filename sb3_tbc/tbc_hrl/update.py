@@ -93,13 +93,19 @@ class FlatParameters:
             start += p.numel()
 
     def is_aliased(self) -> bool:
-        """Whether the modules still share the vector's memory (``policy.to(...)`` may have moved them)."""
+        """Whether the modules still share the vector's memory; copying or moving a policy ends that."""
         start = self.vector.data_ptr()
         for p in self._parameters:
             if p.data_ptr() != start:
                 return False
             start += p.numel() * p.element_size()
         return True
+
+    def sync(self) -> None:
+        """Take over the modules' values if they no longer share the vector's memory, and share it again."""
+        if not self.is_aliased():
+            self.vector.data.copy_(th.cat([p.detach().flatten() for p in self._parameters]))
+            self.alias()
 
     def unflatten(self, vector: th.Tensor) -> list[th.Tensor]:
         """Views of a vector in the blocks' shapes; differentiable."""
@@ -231,6 +237,7 @@ class SACUpdate:
     def _state(self) -> Iterator[th.Tensor]:
         """Everything an update changes besides statistics and temperature, read afresh since loading replaces some."""
         for flat in (self.actor, self.critic, self.target, self.average):
+            flat.sync()
             yield flat.vector.data
         for optimizer in self.optimizers():
             moments = self._adam_state(optimizer)
