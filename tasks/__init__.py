@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
+from inspect import signature
 from typing import Any
 
 import gymnasium
@@ -19,17 +21,27 @@ TASKS = tuple(_CLASSES)
 """Names of the tasks; the id of each is ``sb3_tbc/<name>-v0``."""
 
 
-def make_task(task: str, **kwargs: Any) -> gymnasium.Env[Any, Any]:
+def make_task(task: str, perturb: Mapping[str, Any] | None = None, **kwargs: Any) -> gymnasium.Env[Any, Any]:
     """Build a task; the entry point behind ``gymnasium.make("sb3_tbc/<task>-v0", **kwargs)``.
 
     :param task: one of :data:`TASKS`
+    :param perturb: arguments of :class:`sb3_tbc.tasks.perturb.Perturb`; none by default
     :param kwargs: passed to the task's class
+    :raises ValueError: for an unknown task or perturbation
     """
     if task not in _CLASSES:
         raise ValueError(f"task must be one of {TASKS}, got {task!r}")
     task_class = getattr(import_module(f"{__name__}.{_CLASSES[task]}"), task)
     env: gymnasium.Env[Any, Any] = task_class(**kwargs)
-    return env
+    if not perturb:
+        return env
+    perturb_class = import_module(f"{__name__}.perturb").Perturb
+    allowed = list(signature(perturb_class).parameters)[1:]
+    unknown = sorted(set(perturb) - set(allowed))
+    if unknown:
+        raise ValueError(f"perturb has unknown keys {unknown}; allowed are {allowed}")
+    perturbed: gymnasium.Env[Any, Any] = perturb_class(env, **perturb)
+    return perturbed
 
 
 def register_tasks() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -52,6 +52,10 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     goal_high: ClassVar[tuple[float, ...]]
     goal_tolerance: ClassVar[tuple[float, ...]]
     """Largest difference per goal coordinate that counts as success (inclusive), task units."""
+    dynamics_names: ClassVar[tuple[str, ...]] = ()
+    """Physical quantities that :meth:`set_dynamics` can scale."""
+    goal_is_fixed: ClassVar[bool] = False
+    """Whether every episode has the same desired goal."""
     observation_scale: Array
     """Typical magnitude of each entry: ``observation / observation_scale`` lies about in [-1, 1]."""
     goal_scale: Array
@@ -226,6 +230,45 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         :param text: a short line
         """
         self._overlay = (None if subgoal is None else np.array(subgoal, dtype=np.float64), time_left, text)
+
+    @property
+    def frame_dim(self) -> int:
+        """Entries per frame where ``observation`` stacks several frames, else its length."""
+        return len(self.observation_scale)
+
+    def switch_goal(self) -> None:
+        """Draw another desired goal in the middle of an episode."""
+        self._goal = np.array(self._sample_goal(), dtype=np.float64)
+        self._goal_list = self._goal.tolist()
+
+    def check_dynamics(self, names: Iterable[str]) -> None:
+        """Refuse quantities that this task cannot scale.
+
+        :raises ValueError: naming those it can
+        """
+        unknown = sorted(set(names) - set(self.dynamics_names))
+        if unknown:
+            raise ValueError(
+                f"{type(self).__name__} cannot scale {unknown}; dynamics_scale may name {list(self.dynamics_names)}"
+            )
+
+    def set_dynamics(self, scales: Mapping[str, float]) -> None:
+        """Multiply physical quantities by factors from the next reset on; quantities not named get their own value.
+
+        :param scales: factors by name, see :attr:`dynamics_names`
+        """
+        self.check_dynamics(scales)
+        self._apply_dynamics({name: scales.get(name, 1.0) for name in self.dynamics_names})
+
+    def _apply_dynamics(self, scales: dict[str, float]) -> None:
+        """Take over factors, one for each of :attr:`dynamics_names`."""
+
+    def check_action(self, action: ArrayLike) -> None:
+        """Refuse what :meth:`step` would refuse.
+
+        :raises ValueError: for an action of the wrong shape or type, or one that is not finite
+        """
+        self._legal(action)
 
     # -- inner workings --------------------------------------------------------------------------------------------
 

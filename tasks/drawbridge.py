@@ -42,6 +42,8 @@ class Drawbridge(GoalTask):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 60}
+    dynamics_names = ("actuator", "bridge")
+    goal_is_fixed = True
     max_episode_steps = 1000
     goal_low = (-1.0,)
     goal_high = (1.0,)
@@ -55,6 +57,12 @@ class Drawbridge(GoalTask):
         self._position = self._speed = self._sails = 0.0
         self._angle = -0.0
         self._phase = -1.0
+        self._thrust, self._bridge_speed = 0.0001, 0.4
+
+    @property
+    def frame_dim(self) -> int:
+        """One frame."""
+        return FRAME_DIM if self.layout == "paper" else 4
 
     def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
         paper = self.layout == "paper"
@@ -76,14 +84,17 @@ class Drawbridge(GoalTask):
         self._position = self._speed = self._sails = 0.0
         self._update_bridge(0)
 
+    def _apply_dynamics(self, scales: dict[str, float]) -> None:
+        self._thrust, self._bridge_speed = 0.0001 * scales["actuator"], 0.4 * scales["bridge"]
+
     def _update_bridge(self, step: int) -> None:
-        self._angle = -min(max(step - 500, 0) * 0.4, 90.0)
+        self._angle = -min(max(step - 500, 0) * self._bridge_speed, 90.0)
         self._phase = 2.0 * step / self.max_episode_steps - 1.0
 
     def _advance(self, action: list[float]) -> None:
         self._sails = min(max(self._sails + 0.03 * action[0], 0.0), 1.0)
         self._position = min(max(self._position + self._speed, 0.0), LENGTH)
-        self._speed = min(max(self._speed + 0.0001 * self._sails, -MAX_SPEED), MAX_SPEED)
+        self._speed = min(max(self._speed + self._thrust * self._sails, -MAX_SPEED), MAX_SPEED)
         self._update_bridge(self._elapsed)
         if self._angle > -25.0 and self._position > BRIDGE and self._speed > 0.0:
             self._speed *= -0.1

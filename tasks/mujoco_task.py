@@ -24,6 +24,7 @@ class MujocoTask(GoalTask):
 
     xml: ClassVar[str]
     frame_skip: ClassVar[int]
+    dynamics_names: ClassVar[tuple[str, ...]] = ("mass", "damping", "gravity", "friction", "actuator")
 
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
@@ -35,6 +36,7 @@ class MujocoTask(GoalTask):
         self._qvel: Array = self.data.qvel
         self._ctrl: Array = self.data.ctrl
         self._scene: Scene | None = None
+        self._nominal = {name: [field.copy() for field in fields] for name, fields in _fields(self.model).items()}
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
 
     @abstractmethod
@@ -59,6 +61,12 @@ class MujocoTask(GoalTask):
     def task_state(self) -> dict[str, Array]:
         """``qpos`` and ``qvel`` of the model."""
         return {"qpos": self._qpos.copy(), "qvel": self._qvel.copy()}
+
+    def _apply_dynamics(self, scales: dict[str, float]) -> None:
+        for name, fields in _fields(self.model).items():
+            for field, nominal in zip(fields, self._nominal[name], strict=True):
+                field[:] = nominal * scales.get(name, 1.0)
+        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
 
     # -- pictures --------------------------------------------------------------------------------------------------
 
@@ -88,3 +96,14 @@ class MujocoTask(GoalTask):
         if self._scene is not None:
             self._scene.close()
             self._scene = None
+
+
+def _fields(model: mujoco.MjModel) -> dict[str, list[Array]]:
+    """Views of the model's numbers behind each name of ``dynamics_names``."""
+    return {
+        "mass": [model.body_mass, model.body_inertia],
+        "damping": [model.dof_damping],
+        "gravity": [model.opt.gravity],
+        "friction": [model.geom_friction[:, :1]],
+        "actuator": [model.actuator_gainprm[:, :1], model.actuator_biasprm[:, :3]],
+    }

@@ -51,6 +51,7 @@ class Pendulum(MujocoTask):
     frame_skip: ClassVar[int] = 10
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
     max_episode_steps = 1000
+    dynamics_names = ("mass", "damping", "gravity", "actuator")
     action_bound = (2.0,)
     goal_low = (-math.pi, -MAX_SPEED)
     goal_high = (math.pi, MAX_SPEED)

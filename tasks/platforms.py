@@ -54,6 +54,7 @@ class Platforms(GoalTask):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 60}
+    dynamics_names = ("mass", "gravity", "friction", "actuator")
     max_episode_steps = 500
     goal_low = (-2.0, -2.0)
     goal_high = (2.0, 2.0)
@@ -68,7 +69,13 @@ class Platforms(GoalTask):
         self._frequency1 = 3.0 if legacy_quirks else 2.0
         self._active = False
         self._since = 0
+        self._scales = dict.fromkeys(self.dynamics_names, 1.0)
         self._build()
+
+    @property
+    def frame_dim(self) -> int:
+        """One frame."""
+        return FRAME_DIM if self.layout == "paper" else 13
 
     def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
         paper = self.layout == "paper"
@@ -85,7 +92,9 @@ class Platforms(GoalTask):
         return np.ones(N_FRAMES * FRAME_DIM if paper else 13), np.ones(2), subgoals
 
     def _build(self) -> None:
-        self._world = world = self._b2.b2World(gravity=(0, -9.8))
+        scales = self._scales
+        self._force = FORCE * scales["actuator"]
+        self._world = world = self._b2.b2World(gravity=(0, -9.8 * scales["gravity"]))
         for centre, (width, height) in STATIC:
             world.CreateStaticBody(position=centre, fixtures=box_fixture(width / 2, height / 2))
         platform = box_fixture(PLATFORM_SIZE[0] / 2, PLATFORM_SIZE[1] / 2)
@@ -94,6 +103,14 @@ class Platforms(GoalTask):
         # The order of creation is the order in which contacts are solved, so it matters to the last bit.
         ball = circle_fixture(RADIUS, density=1.0, restitution=0.4)
         self._ball = world.CreateDynamicBody(position=(-0.8, -0.55), fixtures=ball)
+        if scales["friction"] != 1.0 or scales["mass"] != 1.0:
+            fixture = self._ball.fixtures[0]
+            fixture.friction, fixture.density = 0.2 * scales["friction"], scales["mass"]
+            self._ball.ResetMassData()
+
+    def _apply_dynamics(self, scales: dict[str, float]) -> None:
+        self._scales = scales
+        self._build()
 
     def _sample_goal(self) -> Sequence[float]:
         return [-0.5 + self.np_random.uniform(-0.1, 0.1), 0.45]
@@ -119,7 +136,7 @@ class Platforms(GoalTask):
 
     def _advance(self, action: list[float]) -> None:
         ball = self._ball
-        ball.ApplyForceToCenter((action[0] * FORCE, 0.0), True)
+        ball.ApplyForceToCenter((action[0] * self._force, 0.0), True)
         self._move_platforms(self._elapsed)
         self._world.Step(DT, 10, 8)
         self._world.ClearForces()

@@ -44,6 +44,7 @@ class Tennis2D(GoalTask):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
+    dynamics_names = ("mass", "damping", "gravity", "actuator")
     max_episode_steps = 500
     action_bound = (1.0,) * 3
     goal_low = (-math.inf, 0.0, 0.0, 0.0)
@@ -55,7 +56,8 @@ class Tennis2D(GoalTask):
     ) -> None:
         self._b2 = load_box2d()
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
-        self._arena = TennisWorld(self._b2)
+        self._scales = dict.fromkeys(self.dynamics_names, 1.0)
+        self._arena = TennisWorld(self._b2, **self._scales)
         self._bounces = 0
         self._second = False
         if legacy_quirks:
@@ -90,9 +92,13 @@ class Tennis2D(GoalTask):
     def _restart(self, state: dict[str, Array]) -> None:
         shot = state["ball_shot"].tolist() if "ball_shot" in state else self._sample_shot()
         if not self.legacy_quirks:
-            self._arena = TennisWorld(self._b2)
+            self._arena = TennisWorld(self._b2, **self._scales)
         self._arena.restart(shot[:5], None if self.legacy_quirks else shot[5])
         self._bounces, self._second = 0, False
+
+    def _apply_dynamics(self, scales: dict[str, float]) -> None:
+        self._scales = scales
+        self._arena = TennisWorld(self._b2, **scales)
 
     def _advance(self, action: list[float]) -> None:
         arena = self._arena

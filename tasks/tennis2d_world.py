@@ -31,24 +31,37 @@ class TennisWorld:
     ``floor_contact``, ``racket_contact`` and ``floor_contact_x`` tell what the ball touched in the last step.
 
     :param b2: the Box2D module
+    :param mass: factor on the mass of rods and racket
+    :param damping: factor on their damping
+    :param gravity: factor on gravity
+    :param actuator: factor on the torques
     """
 
-    def __init__(self, b2: ModuleType) -> None:
+    def __init__(
+        self, b2: ModuleType, mass: float = 1.0, damping: float = 1.0, gravity: float = 1.0, actuator: float = 1.0
+    ) -> None:
+        self._torques = [limit * actuator for limit in MAX_TORQUE]
         self.floor_contact = self.racket_contact = False
         self.floor_contact_x = math.nan
-        self.world = world = b2.b2World(gravity=(0, -8.0))
+        self.world = world = b2.b2World(gravity=(0, -8.0 * gravity))
         self.ground = world.CreateStaticBody(position=(3, -10), fixtures=box_fixture(12, 10))
         ball = circle_fixture(BALL_RADIUS, density=0.01, restitution=0.9, groupIndex=-1)
         self.ball = world.CreateDynamicBody(position=(6, 1), fixtures=ball, bullet=True)
-        self.links, self.joints = self._add_arm()
+        self.links, self.joints = self._add_arm(damping)
+        if mass != 1.0:
+            for link in self.links:
+                link.fixtures[0].density *= mass
+                link.ResetMassData()
         # The world keeps no reference to its listener.
         self._listener = world.contactListener = _listener_class(b2)(self)
 
-    def _add_arm(self) -> tuple[list[Any], list[Any]]:
+    def _add_arm(self, damping: float) -> tuple[list[Any], list[Any]]:
         rod = box_fixture(*ROD_HALF, density=0.1, restitution=0.0, groupIndex=-1)
         racket = box_fixture(*RACKET_HALF, density=0.1, restitution=0.75, groupIndex=0)
         links = [
-            self.world.CreateDynamicBody(position=(ROBOT_X, y), linearDamping=0.1, angularDamping=4.4, fixtures=fixture)
+            self.world.CreateDynamicBody(
+                position=(ROBOT_X, y), linearDamping=0.1 * damping, angularDamping=4.4 * damping, fixtures=fixture
+            )
             for fixture, y in ((rod, 0.25), (rod, 0.75), (racket, 1.015))
         ]
         joints = [
@@ -95,7 +108,7 @@ class TennisWorld:
     def step(self, action: Sequence[float], dt: float) -> None:
         """Advance by ``dt`` seconds with torques given as shares of their maxima."""
         self._forget_contacts()
-        for joint, share, limit in zip(self.joints, action, MAX_TORQUE, strict=True):
+        for joint, share, limit in zip(self.joints, action, self._torques, strict=True):
             torque = share * limit
             joint.motorSpeed = math.copysign(MOTOR_SPEED, torque) if torque else 0.0
             joint.maxMotorTorque = min(abs(torque), limit)

@@ -102,6 +102,11 @@ class UR5Reacher(MujocoTask):
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
         self._history = FrameHistory(N_FRAMES, 6) if observation == "paper" else None
 
+    @property
+    def frame_dim(self) -> int:
+        """Angles and velocities."""
+        return 6
+
     def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
         return describe_arm(N_FRAMES if self.layout == "paper" else 1)
 

@@ -1,0 +1,133 @@
+"""Stress variants: off by default, seeded, and each disturbs what it says."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from sb3_tbc.tasks.perturb import Perturb
+
+import sb3_tbc  # noqa: F401  (registers the tasks)
+
+SIX = ["AntFourRooms", "Drawbridge", "Pendulum", "Platforms", "Tennis2D", "UR5Reacher"]
+
+
+def make(task, **kwargs):
+    return gym.make(f"sb3_tbc/{task}-v0", **kwargs)
+
+
+def trace(env, n=20, seed=0, action_seed=0):
+    rng = np.random.default_rng(action_seed)
+    actions = rng.uniform(env.action_space.low, env.action_space.high, (n, *env.action_space.shape))
+    seen = [env.reset(seed=seed)[0]]
+    for action in actions:
+        seen.append(env.step(action)[0])
+    return seen
+
+
+def stack(seen, key="observation"):
+    return np.stack([observation[key] for observation in seen])
+
+
+def test_off_by_default():
+    for perturb in (None, {}):
+        assert not isinstance(make("Pendulum", perturb=perturb), Perturb)
+
+
+@pytest.mark.parametrize("task", SIX)
+def test_neutral_perturbation_changes_nothing(task):
+    names = make(task).unwrapped.dynamics_names
+    neutral = {"observation_noise": 0.0, "action_delay": 0, "dynamics_scale": dict.fromkeys(names, 1.0)}
+    np.testing.assert_array_equal(stack(trace(make(task, perturb=neutral))), stack(trace(make(task))))
+
+
+@pytest.mark.parametrize("task", SIX)
+def test_seeded(task):
+    perturb = {
+        "observation_noise": 0.05,
+        "action_delay": 2,
+        "dynamics_scale": {"actuator": [0.5, 1.5]},
+        "goal_switch": 0.0 if task == "Drawbridge" else 0.3,
+    }
+    env = make(task, perturb=perturb)
+    one, other = trace(env), trace(make(task, perturb=perturb))
+    for key in one[0]:
+        np.testing.assert_array_equal(stack(one, key), stack(other, key))
+        np.testing.assert_array_equal(stack(one, key), stack(trace(env), key))  # nothing stays from the episode before
+    assert not np.array_equal(stack(one), stack(trace(env, seed=1)))
+    assert env.spec.id == f"sb3_tbc/{task}-v0"
+    assert env.unwrapped.subgoals.dim > 0
+
+
+def test_noise_has_the_stated_size_and_spares_goals():
+    seen, clean = trace(make("UR5Reacher", perturb={"observation_noise": 0.1}), 200), trace(make("UR5Reacher"), 200)
+    noise = (stack(seen) - stack(clean)) / make("UR5Reacher").unwrapped.observation_scale
+    assert abs(noise[:, -6:].std() - 0.1) < 0.01
+    np.testing.assert_array_equal(noise[20, :-6], noise[19, 6:])  # a frame keeps its noise
+    np.testing.assert_array_equal(stack(seen, "achieved_goal"), stack(clean, "achieved_goal"))
+
+
+def test_delay_shifts_actions():
+    late, prompt = make("Drawbridge", perturb={"action_delay": 3}), make("Drawbridge")
+    late.reset()
+    prompt.reset()
+    for action in (0.0, 0.0, 0.0):
+        prompt.step(np.array([action]))
+    for action in (1.0, -0.5, 0.3):
+        late.step(np.array([action]))
+    for action in (1.0, -0.5, 0.3):
+        seen, expected = late.step(np.zeros(1)), prompt.step(np.array([action]))
+        np.testing.assert_array_equal(seen[0]["observation"], expected[0]["observation"])
+    with pytest.raises(ValueError, match="finite"):
+        late.step(np.array([np.nan]))
+
+
+@pytest.mark.parametrize("task", SIX)
+def test_every_named_quantity_matters(task):
+    plain = stack(trace(make(task), 60))
+    for name in make(task).unwrapped.dynamics_names:
+        if (task, name) in {("Drawbridge", "bridge"), ("UR5Reacher", "friction"), ("AntFourRooms", "friction")}:
+            continue  # later in the episode, or on contact
+        changed = stack(trace(make(task, perturb={"dynamics_scale": {name: 1.4}}), 60))
+        assert not np.array_equal(plain, changed), name
+        assert np.isfinite(changed).all()
+
+
+def test_scaled_pendulum_follows_its_equation():
+    """Falling from the horizontal, twice the mass under half gravity accelerates half as fast."""
+    start = {"state": {"qpos": [np.pi / 2], "qvel": [0.0]}}
+    speeds = []
+    for scale in ({"damping": 1e-9}, {"damping": 1e-9, "mass": 2.0, "gravity": 0.5}):
+        env = make("Pendulum", perturb={"dynamics_scale": scale})
+        env.reset(options=start)
+        speeds.append(env.unwrapped.task_state()["qvel"][0])
+    assert speeds[1] == pytest.approx(speeds[0] / 2, rel=1e-6)
+
+
+def test_goals_switch_consistently():
+    env = make("Pendulum", perturb={"goal_switch": 0.5})
+    env.reset(seed=0)
+    goals = []
+    for _ in range(40):
+        observation, reward, terminated, _, info = env.step(env.action_space.sample())
+        goals.append(observation["desired_goal"])
+        assert reward == env.unwrapped.compute_reward(observation["achieved_goal"], goals[-1], info)
+        assert terminated == info["is_success"]
+    assert 8 < len(np.unique(goals, axis=0)) < 35
+
+
+@pytest.mark.parametrize(
+    ("task", "perturb", "word"),
+    [
+        ("Pendulum", {"noise": 0.1}, "observation_noise"),
+        ("Pendulum", {"observation_noise": -1.0}, "observation_noise"),
+        ("Pendulum", {"observation_noise": np.nan}, "observation_noise"),
+        ("Pendulum", {"action_delay": 1.5}, "whole number"),
+        ("Pendulum", {"goal_switch": 2.0}, "goal_switch"),
+        ("Pendulum", {"dynamics_scale": {"colour": 1.0}}, "mass"),
+        ("Pendulum", {"dynamics_scale": {"mass": [2.0, 1.0]}}, "range"),
+        ("Pendulum", {"dynamics_scale": {"mass": 0.0}}, "positive"),
+        ("Drawbridge", {"goal_switch": 0.1}, "always the same"),
+    ],
+)
+def test_mistakes_are_explained(task, perturb, word):
+    with pytest.raises(ValueError, match=word):
+        make(task, perturb=perturb)
