@@ -273,3 +273,14 @@ def test_learns_the_corridor() -> None:
     model = make(high=level, low=level, gradient_ratio=1.0, max_options=5)
     model.learn(4000)
     assert evaluate_hierarchical(model, Corridor(), 40, seed=1).success_rate >= 0.9
+
+
+def test_learning_rate_may_fall_linearly_and_is_saved_as_text(tmp_path: Path) -> None:
+    model = make(low={**LEVEL, "learning_rate": "lin_1e-3"})
+    model.learn(200)
+    rate = model.low.policy.actor.optimizer.param_groups[0]["lr"]
+    assert 0 <= rate < 5e-4
+    model.save(tmp_path / "model.zip")
+    assert TBCHRL.load(tmp_path / "model.zip").low_settings["learning_rate"] == "lin_1e-3"
+    with pytest.raises(ValueError, match="lin_"):
+        make(low={**LEVEL, "learning_rate": "cos_1e-3"})

@@ -6,6 +6,7 @@ import difflib
 from collections.abc import Mapping
 from typing import Any
 
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 LEVEL_DEFAULTS: dict[str, Any] = {
@@ -29,6 +30,20 @@ DEFAULT_WIRING = {
     "recurrent_command_synapses": 3,
     "motor_fanin": 5,
 }
+
+
+def learning_rate_of(value: float | str) -> float | LinearSchedule:
+    """A constant learning rate, or ``"lin_<rate>"``: one that falls linearly to zero at the end of training.
+
+    :raises ValueError: if the text is of another form
+    """
+    if not isinstance(value, str):
+        return value
+    try:
+        start = float(value.removeprefix("lin_"))
+    except ValueError:
+        raise ValueError(f"learning_rate must be a number or 'lin_<number>', got {value!r}") from None
+    return LinearSchedule(start, 0.0, 1.0) if value.startswith("lin_") else start
 
 
 def attribute_of(env: VecEnv, name: str) -> Any:

@@ -34,7 +34,7 @@ from sb3_tbc.spaces import FloatArray, SubgoalSpace
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.tbc_hrl.policies import LevelPolicy
-from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, attribute_of, level_settings
+from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, attribute_of, learning_rate_of, level_settings
 from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
 from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 
@@ -225,7 +225,7 @@ class TBCHRL(BaseAlgorithm):
             policy_kwargs["ndbc"] = self._circuit(policy_kwargs, action.shape[0])
         gamma = settings["gamma"]
         level = SACLevel(
-            LevelPolicy, observation, action, None, settings["learning_rate"], gamma, settings["tau"],
+            LevelPolicy, observation, action, None, learning_rate_of(settings["learning_rate"]), gamma, settings["tau"],
             settings["ent_coef"], settings["target_entropy"], policy_kwargs, seed=seed, device=self.device,
             compile=self.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"], name=name,
         )  # fmt: skip
@@ -291,6 +291,7 @@ class TBCHRL(BaseAlgorithm):
             self._low_observation = np.asarray(observation)
             self._forget(window_over, infos)
             self.num_timesteps += self.n_envs
+            self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._update_info_buffer(list(infos), np.array(["episode_over" in info for info in infos]))
             callback.update_locals(locals())
             if not callback.on_step():

@@ -29,7 +29,7 @@ POLICY: Schema = {
     "ndbc": NDBC,
 }
 LEVEL: Schema = {
-    "learning_rate": NUMBER,
+    "learning_rate": (int, float, str),
     "ent_coef_learning_rate": NUMBER,
     "batch_size": int,
     "gamma": NUMBER,
