@@ -170,6 +170,24 @@ def test_report_compares_with_the_strongest_baseline(tmp_path: Path, capsys: pyt
     assert int(cells[8].replace(",", "")) > 0
 
 
+def test_report_fills_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    fake_run(tmp_path / "results", "A", "tbc-hrl", 0, 0.5)
+    page = tmp_path / "README.md"
+    page.write_text("top\n<!-- results:begin -->\nold\n<!-- results:end -->\nbottom\n")
+    for _ in range(2):
+        assert report.main([str(tmp_path / "results"), "--update", str(page)]) == 0
+    text = page.read_text()
+    assert text.startswith("top\n<!-- results:begin -->\n| task")
+    assert text.endswith("<!-- results:end -->\nbottom\n")
+    assert text.count("| A ") == 1
+    assert "old" not in text
+    capsys.readouterr()
+    page.write_text("no marks")
+    assert report.main([str(tmp_path / "results"), "--update", str(page)]) == 2
+    assert "needs the lines" in said(capsys)
+    assert page.read_text() == "no marks"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
