@@ -13,6 +13,7 @@ _CLASSES = {
     "Pendulum": "pendulum",
     "Drawbridge": "drawbridge",
     "UR5Reacher": "ur5_reacher",
+    "UR5ReacherBullet": "ur5_reacher_bullet",
     "AntFourRooms": "ant_four_rooms",
     "Platforms": "platforms",
     "Tennis2D": "tennis2d",

@@ -1,0 +1,277 @@
+"""UR5ReacherBullet: the arm of UR5Reacher in PyBullet, to test policies in an engine they were not trained in."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.spaces import SubgoalSpace
+
+from .base import Array, GoalTask
+from .history import FrameHistory
+from .ur5_reacher import N_FRAMES, START, UR5Reacher, describe_arm, sample_arm_goal
+
+TIME_STEP = 0.002
+SUB_STEPS = 15
+SERVO_GAIN = 10.0
+DAMPING = 10.0
+MAX_TORQUE = 150.0
+MAX_COMMAND = (3.15, 5.0, 3.15)
+URDF_LINKS = (  # name, mass, centre of mass, diagonal inertia, shapes: (urdf geometry, xyz, rpy)
+    ("base_link", 4.0, "0 0 0", (0.00443333, 0.00443333, 0.0072), [("cylinder", 0.0735, 0.024, "0 0 0.009", "0 0 0")]),
+    (
+        "shoulder_link",
+        3.7,
+        "0 0 0",
+        (0.0102675, 0.0102675, 0.00666),
+        [("cylinder", 0.0595, 0.1336, "0 0 0.0016", "0 0 0")],
+    ),
+    (
+        "upper_arm_link",
+        8.393,
+        "0 0 0.28",
+        (0.226891, 0.226891, 0.0151074),
+        [
+            ("cylinder", 0.0597, 0.1338, "0 0.0017 0", "1.5707963267948966 0 0"),
+            ("cylinder", 0.0597, 0.1324, "0 0.001 0.425", "1.5707963267948966 0 0"),
+            ("box", (0.1194, 0.1338, 0.425), None, "0 0.0017 0.2125", "0 0 0"),
+        ],
+    ),
+    (
+        "forearm_link",
+        2.275,
+        "0 0 0.25",
+        (0.0494433, 0.0494433, 0.004095),
+        [
+            ("sphere", 0.058, None, "0 0 0", "0 0 0"),
+            ("capsule", 0.0525, 0.1, "0 0 0.1", "0 0 0"),
+            ("capsule", 0.0455, 0.12, "0 0 0.21", "0 0 0"),
+            ("cylinder", 0.0385, 0.1613, "0 0 0.35065", "0 0 0"),
+        ],
+    ),
+)
+URDF_JOINTS = (  # name, origin, rpy, axis
+    ("shoulder_pan", "0 0 0.089159", "0 0 0", "0 0 1"),
+    ("shoulder_lift", "0 0.13585 0", "0 1.5707963267948966 0", "0 1 0"),
+    ("elbow", "0 -0.1197 0.425", "0 0 0", "0 1 0"),
+)
+
+
+class UR5ReacherBullet(GoalTask):
+    """UR5Reacher with the dynamics of PyBullet; observations, actions, goals and subgoals are the same.
+
+    Links have the same shapes and inertias. The servo torque ``10 (ctrl - qd)`` and the joint damping are computed as
+    MuJoCo does, the damping at the velocity that the sub-step will reach, so that off the floor both engines agree
+    closely; contacts differ. ``legacy_quirks`` has no effect: no public implementation exists.
+
+    :raises ImportError: without PyBullet, naming the extra that installs it
+    """
+
+    metadata: ClassVar[dict[str, Any]] = UR5Reacher.metadata
+    max_episode_steps = UR5Reacher.max_episode_steps
+    action_bound = UR5Reacher.action_bound
+    goal_low, goal_high = UR5Reacher.goal_low, UR5Reacher.goal_high
+    goal_tolerance = UR5Reacher.goal_tolerance
+
+    def __init__(
+        self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
+    ) -> None:
+        self._bullet = load_pybullet()
+        super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
+        self._history = FrameHistory(N_FRAMES, 6) if observation == "paper" else None
+        self._client: int = self._bullet.connect(self._bullet.DIRECT)
+        self._arm = -1
+        self._twin: UR5Reacher | None = None
+        self._build()
+        self._pristine: int = self._bullet.saveState(physicsClientId=self._client)
+
+    @property
+    def frame_dim(self) -> int:
+        """Angles and velocities."""
+        return 6
+
+    def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
+        return describe_arm(N_FRAMES if self.layout == "paper" else 1)
+
+    def _sample_goal(self) -> Sequence[float]:
+        return sample_arm_goal(self.np_random)
+
+    def _state_shapes(self) -> dict[str, tuple[int, ...]]:
+        return {"qpos": (3,), "qvel": (3,)}
+
+    def _build(self) -> None:
+        """Load floor and arm into an empty world."""
+        bullet, client = self._bullet, self._client
+        bullet.resetSimulation(physicsClientId=client)
+        bullet.setGravity(0, 0, -9.81, physicsClientId=client)
+        bullet.setPhysicsEngineParameter(
+            fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=client
+        )
+        plane = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client)
+        floor = bullet.createMultiBody(0, plane, physicsClientId=client)
+        flags = (
+            bullet.URDF_USE_INERTIA_FROM_FILE
+            | bullet.URDF_USE_SELF_COLLISION
+            | bullet.URDF_USE_SELF_COLLISION_EXCLUDE_PARENT
+        )
+        with urdf_file() as path:
+            self._arm = bullet.loadURDF(path, useFixedBase=True, flags=flags, physicsClientId=client)
+        for body, link in ((floor, -1), *((self._arm, link) for link in range(-1, 3))):
+            bullet.changeDynamics(
+                body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, lateralFriction=1.0,
+                spinningFriction=0.005, restitution=0.0, physicsClientId=client,
+            )  # fmt: skip
+        # Joints of a loaded model hold their position unless their motors are switched off.
+        bullet.setJointMotorControlArray(
+            self._arm, range(3), bullet.VELOCITY_CONTROL, forces=[0.0] * 3, physicsClientId=client
+        )
+
+    def _restart(self, state: dict[str, Array]) -> None:
+        self._bullet.restoreState(self._pristine, physicsClientId=self._client)
+        start = [self.np_random.uniform(-math.pi / 8, math.pi / 8), *START]
+        qpos, qvel = state.get("qpos", np.array(start)), state.get("qvel", np.zeros(3))
+        for joint in range(3):
+            self._bullet.resetJointState(self._arm, joint, qpos[joint], qvel[joint], physicsClientId=self._client)
+        self._sub_step([0.0] * 3)
+
+    def _advance(self, action: list[float]) -> None:
+        command = [min(max(a, -limit), limit) for a, limit in zip(action, MAX_COMMAND, strict=True)]
+        for _ in range(SUB_STEPS):
+            self._sub_step(command)
+
+    def _joints(self) -> tuple[list[float], list[float]]:
+        """Angles and velocities."""
+        states = self._bullet.getJointStates(self._arm, range(3), physicsClientId=self._client)
+        return [joint[0] for joint in states], [joint[1] for joint in states]
+
+    def _sub_step(self, command: list[float]) -> None:
+        """Advance by 2 ms; solves ``(M + h D) a = servo - D qd - bias`` for the velocity that damping acts on."""
+        bullet, client = self._bullet, self._client
+        angles, speeds = self._joints()
+        servo = [min(max(SERVO_GAIN * (u - v), -MAX_TORQUE), MAX_TORQUE) for u, v in zip(command, speeds, strict=True)]
+        bias = bullet.calculateInverseDynamics(self._arm, angles, speeds, [0.0] * 3, physicsClientId=client)
+        mass = bullet.calculateMassMatrix(self._arm, angles, physicsClientId=client)
+        wanted = [t - DAMPING * v - b for t, v, b in zip(servo, speeds, bias, strict=True)]
+        acceleration = solve3(mass, TIME_STEP * DAMPING, wanted)
+        torque = [t - DAMPING * (v + TIME_STEP * a) for t, v, a in zip(servo, speeds, acceleration, strict=True)]
+        bullet.setJointMotorControlArray(
+            self._arm, (0, 1, 2), bullet.TORQUE_CONTROL, forces=torque, physicsClientId=client
+        )
+        bullet.stepSimulation(physicsClientId=client)
+
+    def _observe(self, first: bool) -> tuple[Array, list[float]]:
+        angles, speeds = self._joints()
+        achieved = [math.fmod(q, 2 * math.pi) for q in angles]
+        if self._history is None:
+            return np.array(angles + speeds), achieved
+        return self._history.reset(angles + speeds) if first else self._history.push(angles + speeds), achieved
+
+    def task_state(self) -> dict[str, Array]:
+        """``qpos`` and ``qvel`` of the three joints."""
+        angles, speeds = self._joints()
+        return {"qpos": np.array(angles), "qvel": np.array(speeds)}
+
+    def _draw(self) -> NDArray[np.uint8]:
+        """The same picture as UR5Reacher's, of this engine's state."""
+        if self._twin is None:
+            self._twin = UR5Reacher(render_mode="rgb_array")
+        twin = self._twin
+        twin.reset(options={"goal": self._goal, "state": self.task_state()})
+        twin.data.qpos[:] = self.task_state()["qpos"]
+        twin._overlay, twin._elapsed = self._overlay, self._elapsed
+        return twin._draw()
+
+    def close(self) -> None:
+        """Close the window and leave the physics server."""
+        super().close()
+        if self._twin is not None:
+            self._twin.close()
+        if self._client >= 0:
+            self._bullet.disconnect(physicsClientId=self._client)
+            self._client = -1
+
+
+def solve3(matrix: Sequence[Sequence[float]], diagonal: float, right: Sequence[float]) -> tuple[float, float, float]:
+    """Solve ``(matrix + diagonal I) x = right`` for a symmetric 3 x 3 matrix; LAPACK from Python is slower."""
+    (a, b, c), (_, d, e), (_, _, f) = matrix
+    a, d, f = a + diagonal, d + diagonal, f + diagonal
+    ca, cb, cc = d * f - e * e, c * e - b * f, b * e - c * d
+    cd, ce, cf = a * f - c * c, b * c - a * e, a * d - b * b
+    scale = 1.0 / (a * ca + b * cb + c * cc)
+    x, y, z = right
+    return (ca * x + cb * y + cc * z) * scale, (cb * x + cd * y + ce * z) * scale, (cc * x + ce * y + cf * z) * scale
+
+
+def load_pybullet() -> ModuleType:
+    """Import PyBullet, without the line it prints.
+
+    :raises ImportError: naming the extra that installs it
+    """
+    try:
+        with _silent():
+            import pybullet
+    except ImportError as error:
+        raise ImportError("UR5ReacherBullet needs PyBullet. Install it with: pip install 'sb3_tbc[bullet]'") from error
+    module: ModuleType = pybullet
+    return module
+
+
+@contextlib.contextmanager
+def _silent() -> Iterator[None]:
+    """Send what C code prints nowhere."""
+    saved = os.dup(2)
+    try:
+        with open(os.devnull, "wb") as nowhere:
+            os.dup2(nowhere.fileno(), 2)
+        yield
+    finally:
+        os.dup2(saved, 2)
+        os.close(saved)
+
+
+@contextlib.contextmanager
+def urdf_file() -> Iterator[str]:
+    """The arm as a URDF file that exists inside the ``with`` block; PyBullet reads models from files only."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "ur5.urdf"
+        path.write_text(urdf())
+        yield str(path)
+
+
+def urdf() -> str:
+    """The arm of ``ur5_reacher.MODEL`` in URDF."""
+    links = "".join(_link(*link) for link in URDF_LINKS)
+    names = [link[0] for link in URDF_LINKS]
+    joints = "".join(
+        f'<joint name="{name}" type="continuous"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{xyz}" rpy="{rpy}"/><axis xyz="{axis}"/><dynamics damping="0" friction="0"/></joint>'
+        for (name, xyz, rpy, axis), parent, child in zip(URDF_JOINTS, names[:-1], names[1:], strict=True)
+    )
+    return f'<robot name="ur5">{links}{joints}</robot>'
+
+
+def _link(name: str, mass: float, com: str, inertia: tuple[float, ...], shapes: list[tuple[Any, ...]]) -> str:
+    ixx, iyy, izz = inertia
+    collisions = "".join(
+        f'<collision><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{_geometry(kind, size, length)}</geometry></collision>'
+        for kind, size, length, xyz, rpy in shapes
+    )
+    return (
+        f'<link name="{name}"><inertial><origin xyz="{com}"/><mass value="{mass}"/>'
+        f'<inertia ixx="{ixx}" iyy="{iyy}" izz="{izz}" ixy="0" ixz="0" iyz="0"/></inertial>{collisions}</link>'
+    )
+
+
+def _geometry(kind: str, size: Any, length: float | None) -> str:
+    if kind == "box":
+        return f'<box size="{size[0]} {size[1]} {size[2]}"/>'
+    return f'<{kind} radius="{size}"' + (f' length="{length}"/>' if length is not None else "/>")
