@@ -169,7 +169,7 @@ def test_the_schema_is_what_the_agent_takes() -> None:
 
 @pytest.mark.parametrize("config", ["paper", "tuned"])
 @pytest.mark.parametrize("algo", sorted(COLUMN))
-@pytest.mark.parametrize("task", sorted(task_names()))
+@pytest.mark.parametrize("task", TASKS)
 def test_every_shipped_section_builds(task: str, algo: str, config: str) -> None:
     small = parse_overrides(["low.buffer_size:1000", "high.buffer_size:1000", "compile:false"])
     run = load_config(algo, task, config, small)
