@@ -284,3 +284,10 @@ def test_learning_rate_may_fall_linearly_and_is_saved_as_text(tmp_path: Path) ->
     assert TBCHRL.load(tmp_path / "model.zip").low_settings["learning_rate"] == "lin_1e-3"
     with pytest.raises(ValueError, match="lin_"):
         make(low={**LEVEL, "learning_rate": "cos_1e-3"})
+
+
+def test_short_runs_do_not_wait_for_a_compiler() -> None:
+    model = make(compile="auto", gradient_ratio=1.0)
+    model.learn(150)
+    assert not model.low.compiled
+    assert model.low._n_updates > 0

@@ -196,12 +196,14 @@ class SACLevel(SAC):
     def _ent_coef_state(self) -> th.Tensor:
         return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef
 
-    def prepare(self, batch_size: int) -> float:
+    def prepare(self, batch_size: int, compile: bool | str | None = None) -> float:
         """Compile the update for a batch size now rather than in the first :meth:`train`.
 
+        :param compile: changes how updates run from now on; by default as the level was made
         :return: seconds it took
         """
         start = time.perf_counter()
+        self._update.choose(self.compile if compile is None else compile)
         self._update.prepare(batch_size, self._ent_coef_state())
         return time.perf_counter() - start
 

@@ -41,6 +41,10 @@ from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
 
 
+MIN_UPDATES_TO_COMPILE = 3000
+"""With ``compile="auto"`` fewer updates than this run eagerly: compiling costs about as much as they do."""
+
+
 class Replay(NamedTuple):
     """The replay buffers of both levels."""
 
@@ -76,7 +80,7 @@ class TBCHRL(BaseAlgorithm):
     :param memory: when the membrane is reset: ``"window"``, ``"episode"`` or ``"none"`` (every step)
     :param relative_subgoals: show the low level the distance to its subgoal instead of the subgoal itself
     :param subgoals: the subgoal space, for environments that do not bring one
-    :param compile: compile the updates: ``"auto"`` (where a C++ compiler is found), True or False
+    :param compile: compile the updates: ``"auto"`` (where a C++ compiler is found and it pays), True or False
     :raises ValueError: on unknown settings or an environment without goals
     """
 
@@ -258,6 +262,7 @@ class TBCHRL(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> SelfTBCHRL:
         """Collect whole episodes, then update both levels in a burst, until ``total_timesteps`` steps are done."""
+        self._prepare_updates(total_timesteps)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -279,6 +284,15 @@ class TBCHRL(BaseAlgorithm):
                 self.dump_logs()
         callback.on_training_end()
         return self
+
+    def _prepare_updates(self, total_timesteps: int) -> None:
+        """Compile before the clock starts, so that neither speed nor progress bar counts it."""
+        few = self.gradient_ratio * total_timesteps < MIN_UPDATES_TO_COMPILE
+        compile = False if self.compile == "auto" and few else self.compile
+        for level, settings in ((self.high, self.high_settings), (self.low, self.low_settings)):
+            seconds = level.prepare(settings["batch_size"], compile)
+            if self.verbose and level.compiled:
+                print(f"{level.log_prefix[:-1]} level: update compiled in {seconds:.0f} s")
 
     def collect_rollouts(self, callback: BaseCallback, total_timesteps: int) -> bool:
         """Act until an episode is over (or the steps are used up); False if a callback asks to stop."""

@@ -267,6 +267,12 @@ class SACUpdate:
             self._steps[key] = compile_step(self._step, example, self.compile)
         return self._steps[key]
 
+    def choose(self, compile: bool | str) -> None:
+        """Run updates compiled or eagerly from now on."""
+        if compile != self.compile:
+            self.compile = compile
+            self._steps.clear()
+
     def prepare(self, batch_size: int, ent_coef: th.Tensor) -> None:
         """Compile for a batch size now rather than at the first update."""
         shapes = self._shapes(1, batch_size).values()
