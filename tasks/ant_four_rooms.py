@@ -50,7 +50,7 @@ def ant_xml() -> str:
     return f"""
 <mujoco model="ant_four_rooms">{ASSETS}
   <compiler angle="degree" inertiafromgeom="true" autolimits="true"/>
-  <option timestep="0.02" integrator="RK4"/>
+  <option timestep="0.02" integrator="RK4"><flag island="disable"/></option>
   <size njmax="500" nconmax="200"/>
   <default>
     <joint armature="1" damping="1"/>
