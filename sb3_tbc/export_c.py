@@ -1,0 +1,192 @@
+"""The policy as one C99 file: no allocation, no dependency beyond ``math.h``; integrated and closed form."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.export_policy import MLP, Circuit, Coordinate, ExportedPolicy, FloatArray
+
+
+def to_c(policy: ExportedPolicy) -> str:
+    """Source text of the policy; its head says how it is used.
+
+    :param policy: what to export
+    """
+    circuit = isinstance(policy.low, Circuit)
+    low = _circuit(policy.low) if isinstance(policy.low, Circuit) else _mlp("low", policy.low)
+    values = {
+        "TASK": re.sub(r"[^A-Za-z0-9_.-]", "_", policy.task),
+        "SIZES": _sizes(policy),
+        "LOW_DATA": low,
+        "LOW_CODE": _template("export_circuit.c") if circuit else _LOW_MLP,
+        "HIGH_DATA": _mlp("high", policy.high) + _option_data(policy),
+        "ACHIEVED": "\n".join(_coordinate(i, c) for i, c in enumerate(policy.achieved)) or "    (void)entries;",
+        "REACHED": _reached(policy),
+        "HIGH_INPUTS": _high_inputs(policy),
+        "FORGET": {"window": "over", "episode": "started", "none": "1"}[policy.memory],
+        "ASKED": "state->subgoal[i] - here[i]" if policy.relative_subgoals else "state->subgoal[i]",
+    }
+    text = _template("export_policy.c")
+    for name, value in values.items():
+        text = text.replace(f"@{name}@", value)
+    return text
+
+
+def _template(name: str) -> str:
+    return (files("sb3_tbc") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _sizes(policy: ExportedPolicy) -> str:
+    sizes = {
+        "OBSERVATION": policy.n_observation,
+        "ACHIEVED_GOAL": policy.n_achieved,
+        "DESIRED_GOAL": policy.n_desired,
+        "ACTION": len(policy.action_low),
+        "SUBGOAL": policy.subgoal_dim,
+        "LOW_INPUT": policy.n_low_inputs,
+        "STATE": policy.state_dim,
+    }
+    return "\n".join(f"#define TBC_{name} {size}" for name, size in sizes.items())
+
+
+def floats(values: FloatArray) -> str:
+    """Single-precision literals that read back exactly."""
+    literals = [f"{np.float32(v):.9g}" for v in np.asarray(values).ravel()]
+    return ", ".join((x if any(c in x for c in ".en") else x + ".0") + "f" for x in literals)
+
+
+def array(name: str, values: FloatArray) -> str:
+    """A constant array of floats."""
+    return f"static const float {name}[{max(1, np.size(values))}] = {{{floats(values) or '0.0f'}}};\n"
+
+
+def _indices(name: str, values: NDArray[np.integer]) -> str:
+    kind = "unsigned char" if values.max(initial=0) < 256 else "unsigned short"
+    listed = ", ".join(str(int(v)) for v in values) or "0"
+    return f"static const {kind} {name}[{max(1, len(values))}] = {{{listed}}};\n"
+
+
+def _sparse(name: str, matrix: FloatArray, columns: dict[str, FloatArray]) -> str:
+    """Compressed rows by postsynaptic neuron: where rows begin, presynaptic indices, and one array per column set."""
+    present = matrix.T != 0
+    post, pre = np.nonzero(present)
+    begin = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    text = _indices(f"{name}_begin", begin) + _indices(f"{name}_pre", pre)
+    return text + "".join(array(f"{name}_{column}", values[pre, post]) for column, values in columns.items())
+
+
+def _circuit(c: Circuit) -> str:
+    n, (inputs, inter) = c.n_neurons, c.current_weight.shape
+    sensory, currents = c.from_inputs[:inputs], c.from_inputs[inputs:]
+    ends = np.cumsum(c.layers)
+    sizes = {"SENSORY": inputs, "INTER": inter, "PRESYNAPTIC": len(c.gain), "SUB_STEPS": c.sub_steps}
+    text = "".join(f"#define TBC_{name} {size}\n" for name, size in sizes.items())
+    text += _indices("layer_end", ends)
+    text += array("sensory_gain", c.sensory_gain * c.input_gain) + array("sensory_threshold", c.sensory_threshold)
+    text += array("gain", c.gain) + array("threshold", c.threshold)
+    text += array("rest_weighted", c.rest[:n]) + array("rest_total", c.rest[n:])
+    text += array("capacitance", c.capacitance) + array("current_bias", c.current_bias)
+    text += array("input_conductance", currents[np.arange(inter), np.arange(inter)])
+    text += _sparse("current", c.current_weight, {"weight": c.current_weight * c.input_gain[:, None]})
+    text += _sparse("sensory", sensory[:, n:], {"weighted": sensory[:, :n], "total": sensory[:, n:]})
+    text += _sparse("recurrent", c.recurrent[:, n:], {"weighted": c.recurrent[:, :n], "total": c.recurrent[:, n:]})
+    return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
+
+
+_LOW_MLP = """
+void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT], int closed_form,
+                  float mean[TBC_ACTION])
+{
+    (void)membrane;
+    (void)closed_form;
+    low_network(seen, mean);
+}
+"""
+
+
+def _mlp(name: str, mlp: MLP) -> str:
+    """Weights and one function ``<name>_network(x, y)``."""
+    text, code, source = "", "", "x"
+    last = len(mlp.weights) - 1
+    for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
+        inputs, outputs = weight.shape
+        text += array(f"{name}_w{i}", weight.T) + array(f"{name}_b{i}", bias)
+        target = "y" if i == last else f"h{i}"
+        activation = "linear" if i == last else mlp.activation
+        code += f"    float h{i}[{outputs}];\n" if i < last else ""
+        code += f"    dense_{activation}({inputs}, {outputs}, {name}_w{i}, {name}_b{i}, {source}, {target});\n"
+        source = target
+    declared = "".join(line + "\n" for line in code.splitlines() if line.startswith("    float"))
+    called = "".join(line + "\n" for line in code.splitlines() if not line.startswith("    float"))
+    used = {mlp.activation, "linear"} if last else {"linear"}
+    dense = "".join(
+        _DENSE.replace("@KIND@", k).replace("@RULE@", _RULES[k]).replace("@NAME@", name) for k in sorted(used)
+    )
+    called = re.sub(r"dense_", f"{name}_dense_", called)
+    return f"{text}\n{dense}\nstatic void {name}_network(const float *x, float *y)\n{{\n{declared}{called}}}\n"
+
+
+_RULES = {"linear": "sum", "relu": "sum > 0.0f ? sum : 0.0f", "tanh": "tanhf(sum)"}
+_DENSE = """
+static void @NAME@_dense_@KIND@(int inputs, int outputs, const float *w, const float *b, const float *x, float *y)
+{
+    int i, j;
+    for (j = 0; j < outputs; ++j) {
+        float sum = b[j];
+        for (i = 0; i < inputs; ++i) {
+            sum += w[j * inputs + i] * x[i];
+        }
+        y[j] = @RULE@;
+    }
+}
+"""
+
+
+def _option_data(policy: ExportedPolicy) -> str:
+    text = _indices("local_entry", np.array(policy.local))
+    text += array("subgoal_low", policy.subgoal_low) + array("subgoal_high", policy.subgoal_high)
+    text += array("action_low", policy.action_low) + array("action_high", policy.action_high)
+    bounds = [b if np.isfinite(b) else np.finfo(np.float32).max for b in policy.mean_bounds]
+    text += (
+        f"#define TBC_HIGH_BOUND {floats(np.array(bounds[0]))}\n#define TBC_LOW_BOUND {floats(np.array(bounds[1]))}\n"
+    )
+    return text + f"#define TBC_DT_MIN {policy.dt_min!r}\n#define TBC_DT_MAX {policy.dt_max!r}\n"
+
+
+def _coordinate(index: int, c: Coordinate) -> str:
+    if c.kind == "angle":
+        return f"    here[{index}] = atan2f(entries[{c.first}], entries[{c.second}]);"
+    if c.kind == "wrap":
+        return f"    here[{index}] = fmodf(entries[{c.first}], {floats(np.array(c.high))});"
+    value = f"entries[{c.first}]"
+    value = f"fminf({value}, {floats(np.array(c.high))})" if np.isfinite(c.high) else value
+    value = f"fmaxf({value}, {floats(np.array(c.low))})" if np.isfinite(c.low) else value
+    return f"    here[{index}] = {value};"
+
+
+def _reached(policy: ExportedPolicy) -> str:
+    if policy.window_end != "reached":
+        return "    (void)here;\n    (void)subgoal;\n    return 0;"
+    tests = []
+    for group, threshold in zip(policy.groups, policy.thresholds, strict=True):
+        squares = " + ".join(f"(here[{i}] - subgoal[{i}]) * (here[{i}] - subgoal[{i}])" for i in group)
+        tests.append(f"sqrtf({squares}) < {floats(np.array(threshold))}")
+    return "    return " + "\n        && ".join(tests) + ";"
+
+
+def _high_inputs(policy: ExportedPolicy) -> str:
+    parts = [("desired_goal", policy.n_desired), ("observation", policy.n_observation)]
+    if not policy.achieved_in_observation:
+        parts.append(("achieved_goal", policy.n_achieved))
+    lines = [f"    float seen[{sum(size for _, size in parts)}];"]
+    start = 0
+    for name, size in parts:
+        lines.append(f"    memcpy(seen + {start}, {name}, {size} * sizeof(float));")
+        start += size
+    if policy.achieved_in_observation:
+        lines.append("    (void)achieved_goal;")
+    return "\n".join(lines)

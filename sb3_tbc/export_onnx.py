@@ -1,0 +1,193 @@
+"""The policy as an ONNX graph with explicit state, any batch size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from sb3_tbc.export_policy import MLP, Circuit, Coordinate, ExportedPolicy
+
+OPSET = 17
+STATE_NAMES = ("subgoal", "time_budget", "elapsed", "membrane")
+
+
+class _Graph:
+    """Nodes and constants under construction; every method returns the name of a tensor."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: dict[str, onnx.TensorProto] = {}
+
+    def constant(self, value: Any, dtype: Any = np.float32) -> str:
+        array = np.asarray(value, dtype=dtype)
+        name = f"c{len(self.constants)}"
+        self.constants[name] = numpy_helper.from_array(array, name)
+        return name
+
+    def __call__(self, op: str, *inputs: str, name: str | None = None, **attributes: Any) -> str:
+        output = name or f"t{len(self.nodes)}"
+        self.nodes.append(helper.make_node(op, list(inputs), [output], **attributes))
+        return output
+
+    def affine(self, x: str, scale: Any, shift: Any, dtype: Any = np.float32) -> str:
+        """``x * scale + shift``."""
+        return self("Add", self("Mul", x, self.constant(scale, dtype)), self.constant(shift, dtype))
+
+    def columns(self, x: str, indices: Sequence[int]) -> str:
+        return self("Gather", x, self.constant(indices, np.int64), axis=1)
+
+    def slice(self, x: str, start: int, stop: int) -> str:
+        return self(
+            "Slice", x, self.constant([start], np.int64), self.constant([stop], np.int64), self.constant([1], np.int64)
+        )
+
+    def join(self, *parts: str) -> str:
+        return self("Concat", *parts, axis=1)
+
+    def cast(self, x: str, kind: int, name: str | None = None) -> str:
+        return self("Cast", x, name=name, to=kind)
+
+
+def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
+    """A graph from (observation, achieved_goal, desired_goal, state) to (action, next state).
+
+    State tensors are ``subgoal`` (task units), ``time_budget`` and ``elapsed`` (control steps, float64; ``elapsed`` is
+    -1 before the first option) and ``membrane``; the next ones are called ``next_<name>``. Start an episode with
+    elapsed -1 and zeros elsewhere.
+
+    :param policy: what to export
+    """
+    g = _Graph()
+    entries = g.join("observation", "achieved_goal")
+    here = g.join(*(_coordinate(g, entries, c) for c in policy.achieved)) if policy.achieved else None
+    zero = g.constant(0.0, np.float64)
+    started = g("Less", "elapsed", zero)
+    over = g("Or", started, g("GreaterOrEqual", "elapsed", "time_budget"))
+    if policy.window_end == "reached" and here is not None:
+        late = g("GreaterOrEqual", "elapsed", g.constant(policy.dt_min, np.float64))
+        over = g("Or", over, g("And", late, _reached(g, policy, here)))
+    new_subgoal, new_budget = _high(g, policy)
+    subgoal = g("Where", over, new_subgoal, "subgoal", name="next_subgoal")
+    budget = g("Where", over, new_budget, "time_budget", name="next_time_budget")
+    elapsed = g("Where", over, zero, "elapsed")
+    asked = g("Sub", subgoal, here) if policy.relative_subgoals and here else subgoal
+    left = g("Div", g("Sub", budget, elapsed), g.constant(policy.dt_max, np.float64))
+    remaining = g.cast(g("Clip", left, zero, g.constant(1.0, np.float64)), TensorProto.FLOAT)
+    seen = g.join(g.columns(entries, policy.local), asked, remaining)
+    mean = _low(g, policy, seen, over, started)
+    unit = _squash(g, mean, policy.mean_bounds[1])
+    half = 0.5 * (policy.action_high - policy.action_low)
+    g("Add", g("Mul", unit, g.constant(half)), g.constant(policy.action_low + half), name="action")
+    g("Add", elapsed, g.constant(1.0, np.float64), name="next_elapsed")
+    return _model(g, policy)
+
+
+def _high(g: _Graph, policy: ExportedPolicy) -> tuple[str, str]:
+    """What the high level would choose now: subgoal, and time budget in float64."""
+    parts = ["desired_goal", "observation"] + ([] if policy.achieved_in_observation else ["achieved_goal"])
+    unit = _squash(g, _mlp(g, policy.high, g.join(*parts)), policy.mean_bounds[0])
+    d = policy.subgoal_dim
+    half = 0.5 * (policy.subgoal_high - policy.subgoal_low)
+    subgoal = g.affine(g.slice(unit, 0, d), half, policy.subgoal_low + half)
+    span = 0.5 * (policy.dt_max - policy.dt_min)
+    budget = g.affine(g.cast(g.slice(unit, d, d + 1), TensorProto.DOUBLE), span, policy.dt_min + span, np.float64)
+    return subgoal, budget
+
+
+def _low(g: _Graph, policy: ExportedPolicy, seen: str, over: str, started: str) -> str:
+    """The low level's mean; the circuit's next potentials are named on the way."""
+    if isinstance(policy.low, MLP):
+        return _mlp(g, policy.low, seen)
+    zeros = g.constant(np.zeros((1, policy.state_dim)))
+    if policy.memory == "none":
+        membrane = g("Mul", "membrane", zeros)
+    else:
+        membrane = g("Where", over if policy.memory == "window" else started, zeros, "membrane")
+    potentials = g("Identity", _circuit(g, policy.low, seen, membrane), name="next_membrane")
+    return g("Add", g("MatMul", potentials, g.constant(policy.low.readout)), g.constant(policy.low.readout_bias))
+
+
+def _circuit(g: _Graph, c: Circuit, seen: str, potentials: str) -> str:
+    """K semi-implicit sub-steps."""
+    n, p = c.n_neurons, len(c.gain)
+    scaled = g("Mul", seen, g.constant(c.input_gain))
+    sensed = g("Sigmoid", g.affine(scaled, c.sensory_gain, -c.sensory_threshold))
+    current = g("Tanh", g("Add", g("MatMul", scaled, g.constant(c.current_weight)), g.constant(c.current_bias)))
+    pace = c.capacitance * np.float32(c.sub_steps)
+    constant = c.rest + np.concatenate([np.zeros(n, np.float32), pace])
+    drive = g("Add", g("MatMul", g.join(sensed, current), g.constant(c.from_inputs)), g.constant(constant))
+    gain, threshold, recurrent, inertia = map(g.constant, (c.gain, -c.threshold, c.recurrent, pace))
+    for _ in range(c.sub_steps):
+        released = g("Sigmoid", g("Add", g("Mul", g.slice(potentials, 0, p), gain), threshold))
+        received = g("Add", drive, g("MatMul", released, recurrent))
+        weighted = g("Add", g("Mul", potentials, inertia), g.slice(received, 0, n))
+        potentials = g("Div", weighted, g.slice(received, n, 2 * n))
+    return potentials
+
+
+def _mlp(g: _Graph, mlp: MLP, x: str) -> str:
+    for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
+        x = g("Add", g("MatMul", x, g.constant(weight)), g.constant(bias))
+        if i < len(mlp.weights) - 1:
+            x = g({"relu": "Relu", "tanh": "Tanh"}[mlp.activation], x)
+    return x
+
+
+def _squash(g: _Graph, mean: str, bound: float) -> str:
+    return g("Tanh", g("Clip", mean, g.constant(-bound), g.constant(bound)) if np.isfinite(bound) else mean)
+
+
+def _coordinate(g: _Graph, entries: str, c: Coordinate) -> str:
+    value = g.columns(entries, [c.first])
+    if c.kind == "wrap":
+        return g("Mod", value, g.constant(c.high), fmod=1)
+    if c.kind == "angle":
+        return _angle(g, value, g.columns(entries, [c.second]))
+    value = g("Max", value, g.constant(c.low)) if np.isfinite(c.low) else value
+    return g("Min", value, g.constant(c.high)) if np.isfinite(c.high) else value
+
+
+def _angle(g: _Graph, y: str, x: str) -> str:
+    """atan2 from atan, dividing by the larger of the two."""
+    zero, one, tiny = g.constant(0.0), g.constant(1.0), g.constant(1e-30)
+    steep = g("Greater", g("Abs", y), g("Abs", x))
+    below = g("Where", steep, y, x)
+    below = g("Where", g("Equal", below, zero), tiny, below)
+    ratio = g("Atan", g("Div", g("Where", steep, x, y), below))
+    side = g("Where", g("Less", y, zero), g.constant(-1.0), one)
+    flat = g("Add", ratio, g("Where", g("Less", x, zero), g("Mul", side, g.constant(np.pi)), zero))
+    return g("Where", steep, g("Sub", g("Mul", side, g.constant(np.pi / 2)), ratio), flat)
+
+
+def _reached(g: _Graph, policy: ExportedPolicy, here: str) -> str:
+    member = np.zeros((policy.subgoal_dim, len(policy.groups)))
+    for column, group in enumerate(policy.groups):
+        member[list(group), column] = 1.0
+    difference = g("Sub", here, "subgoal")
+    distances = g("Sqrt", g("MatMul", g("Mul", difference, difference), g.constant(member)))
+    within = g.cast(g("Less", distances, g.constant(policy.thresholds)), TensorProto.FLOAT)
+    return g("Greater", g("ReduceMin", within, axes=[1], keepdims=1), g.constant(0.5))
+
+
+def _model(g: _Graph, policy: ExportedPolicy) -> onnx.ModelProto:
+    def tensor(name: str, width: int, kind: int = TensorProto.FLOAT) -> onnx.ValueInfoProto:
+        return helper.make_tensor_value_info(name, kind, ["n", width])
+
+    widths = {"observation": policy.n_observation, "achieved_goal": policy.n_achieved, "desired_goal": policy.n_desired}
+    inputs = [tensor(name, width) for name, width in widths.items()]
+    outputs = [tensor("action", len(policy.action_low))]
+    state = {"subgoal": policy.subgoal_dim, "time_budget": 1, "elapsed": 1, "membrane": policy.state_dim}
+    for name, width in state.items():
+        if width:
+            kind = TensorProto.DOUBLE if name in ("time_budget", "elapsed") else TensorProto.FLOAT
+            inputs.append(tensor(name, width, kind))
+            outputs.append(tensor(f"next_{name}", width, kind))
+    graph = helper.make_graph(g.nodes, policy.task, inputs, outputs, list(g.constants.values()))
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="sb3_tbc")
+    model.ir_version = 8
+    onnx.checker.check_model(model)
+    return model

@@ -1,0 +1,127 @@
+/* Two-level policy for @TASK@, exported from sb3_tbc. C99, no allocation, no dependency beyond the standard headers.
+ *
+ *     tbc_state state;
+ *     tbc_reset(&state);
+ *     for each control step:
+ *         tbc_step(&state, observation, achieved_goal, desired_goal, 0, action);
+ *
+ * The fifth argument chooses how the circuit is evaluated: 0 integrates its sub-steps as in training, 1 takes the closed
+ * form. To use the functions from another file, define TBC_DECLARATIONS_ONLY there and include this one.
+ * TBC_LOW_LEVEL_ONLY leaves out the high level.
+ */
+#ifndef TBC_POLICY
+#define TBC_POLICY
+
+@SIZES@
+
+typedef struct {
+    float subgoal[TBC_SUBGOAL];       /* task units */
+    double time_budget;               /* control steps */
+    int elapsed;                      /* control steps since the option began; -1: no option yet */
+    float membrane[TBC_STATE + 1];    /* potentials; the last entry is unused */
+} tbc_state;
+
+/* Start of an episode. */
+void tbc_reset(tbc_state *state);
+
+/* One control step; the action is in the environment's units. */
+void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
+              const float achieved_goal[TBC_ACHIEVED_GOAL], const float desired_goal[TBC_DESIRED_GOAL],
+              int closed_form, float action[TBC_ACTION]);
+
+/* The low level alone: means before squashing, from what it sees (local state, subgoal, remaining time in [0, 1]). */
+void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT], int closed_form,
+                  float mean[TBC_ACTION]);
+
+#ifndef TBC_DECLARATIONS_ONLY
+
+#include <math.h>
+#include <string.h>
+
+/* ---------------------------------------------------------------- low level */
+
+@LOW_DATA@@LOW_CODE@
+#ifndef TBC_LOW_LEVEL_ONLY
+
+/* ---------------------------------------------------------------- high level and options */
+
+@HIGH_DATA@
+static float squash(float mean, float bound)
+{
+    return tanhf(fmaxf(-bound, fminf(mean, bound)));
+}
+
+/* Subgoal-space point of a state; only filled in where options may end on reaching their subgoal. */
+static void subgoal_point(const float *entries, float here[TBC_SUBGOAL])
+{
+    memset(here, 0, TBC_SUBGOAL * sizeof(float));
+@ACHIEVED@
+}
+
+static int reached(const float *here, const float *subgoal)
+{
+@REACHED@
+}
+
+static void begin_option(tbc_state *state, const float *observation, const float *achieved_goal,
+                         const float *desired_goal)
+{
+    float unit[TBC_SUBGOAL + 1];
+    int i;
+@HIGH_INPUTS@
+    high_network(seen, unit);
+    for (i = 0; i < TBC_SUBGOAL; ++i) {
+        const float half = 0.5f * (squash(unit[i], TBC_HIGH_BOUND) + 1.0f);
+        state->subgoal[i] = subgoal_low[i] + half * (subgoal_high[i] - subgoal_low[i]);
+    }
+    state->time_budget = TBC_DT_MIN
+        + 0.5 * ((double)squash(unit[TBC_SUBGOAL], TBC_HIGH_BOUND) + 1.0) * (TBC_DT_MAX - TBC_DT_MIN);
+    state->elapsed = 0;
+}
+
+void tbc_reset(tbc_state *state)
+{
+    memset(state, 0, sizeof *state);
+    state->elapsed = -1;
+}
+
+void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
+              const float achieved_goal[TBC_ACHIEVED_GOAL], const float desired_goal[TBC_DESIRED_GOAL],
+              int closed_form, float action[TBC_ACTION])
+{
+    float entries[TBC_OBSERVATION + TBC_ACHIEVED_GOAL], here[TBC_SUBGOAL], seen[TBC_LOW_INPUT], mean[TBC_ACTION];
+    const int n_local = TBC_LOW_INPUT - TBC_SUBGOAL - 1;
+    const int started = state->elapsed < 0;
+    double remaining;
+    int i, over;
+
+    memcpy(entries, observation, TBC_OBSERVATION * sizeof(float));
+    memcpy(entries + TBC_OBSERVATION, achieved_goal, TBC_ACHIEVED_GOAL * sizeof(float));
+    subgoal_point(entries, here);
+    over = started || state->elapsed >= state->time_budget
+        || (state->elapsed >= TBC_DT_MIN && reached(here, state->subgoal));
+    if (@FORGET@) {
+        memset(state->membrane, 0, sizeof state->membrane);
+    }
+    if (over) {
+        begin_option(state, observation, achieved_goal, desired_goal);
+    }
+    for (i = 0; i < n_local; ++i) {
+        seen[i] = entries[local_entry[i]];
+    }
+    for (i = 0; i < TBC_SUBGOAL; ++i) {
+        seen[n_local + i] = @ASKED@;
+    }
+    remaining = (state->time_budget - state->elapsed) / TBC_DT_MAX;
+    seen[TBC_LOW_INPUT - 1] = (float)fmax(0.0, fmin(remaining, 1.0));
+    tbc_low_mean(state->membrane, seen, closed_form, mean);
+    for (i = 0; i < TBC_ACTION; ++i) {
+        const float half = 0.5f * (squash(mean[i], TBC_LOW_BOUND) + 1.0f);
+        action[i] = action_low[i] + half * (action_high[i] - action_low[i]);
+    }
+    state->elapsed += 1;
+}
+
+#endif /* TBC_LOW_LEVEL_ONLY */
+#endif /* TBC_DECLARATIONS_ONLY */
+#endif /* TBC_POLICY */
