@@ -24,7 +24,9 @@ START = (3.22757851e-03, -1.27944547e-01)
 MODEL = f"""
 <mujoco model="ur5">{ASSETS}
   <compiler angle="radian" autolimits="true"/>
-  <option timestep="0.002" gravity="0 0 -9.81" cone="elliptic" impratio="5" tolerance="1e-10"><flag island="disable"/></option>
+  <option timestep="0.002" gravity="0 0 -9.81" cone="elliptic" impratio="5" tolerance="1e-10">
+    <flag island="disable"/>
+  </option>
   <default>
     <geom condim="4" solref="0.01 1" solimp="0.99 0.99 0.01"/>
     <joint type="hinge" damping="10"/>
