@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tbc.spaces import FloatArray
+from sb3_tbc.tbc_hrl.collection import forget
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 
@@ -93,7 +94,7 @@ class _Runner:
             )
             seen, _, window_over, infos = env.step(model.policy._unscale(unit))
             observation = np.asarray(seen)
-            membrane = self._forget(membrane, window_over, infos)
+            membrane = forget(membrane, model.memory, window_over, infos)
             over = [index for index in range(env.num_envs) if infos[index].get("episode_over")]
             for index, episode in zip(over, env.episodes, strict=True):
                 options = episode.options
@@ -110,13 +111,3 @@ class _Runner:
                 )
             env.episodes = []
         return [rows[i] for i in range(per_env) for rows in results]
-
-    def _forget(self, membrane: FloatArray, window_over: NDArray[np.bool_], infos: Any) -> FloatArray:
-        if not membrane.shape[1]:
-            return membrane
-        if self.model.memory == "none":
-            return np.zeros_like(membrane)
-        over = window_over
-        if self.model.memory == "episode":
-            over = np.array(["episode_over" in info for info in infos])
-        return np.where(over[:, None], np.float32(0.0), membrane)

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import io
-import os
 import pathlib
 import time
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
@@ -21,35 +19,23 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
-from sb3_tbc.hindsight import (
-    GoalTest,
-    HighLevelReward,
-    HindsightSettings,
-    high_level_steps,
-    low_level_steps,
-)
+from sb3_tbc.hindsight import HighLevelReward, HindsightSettings
 from sb3_tbc.layout import LevelLayout, check_goal_space
-from sb3_tbc.options import Episode, OptionRules
-from sb3_tbc.spaces import FloatArray, SubgoalSpace
+from sb3_tbc.options import OptionRules
+from sb3_tbc.spaces import SubgoalSpace
+from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, Exploration, goal_test_of
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.tbc_hrl.policies import LevelPolicy
+from sb3_tbc.tbc_hrl.replay import Replay
 from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, attribute_of, learning_rate_of, level_settings
 from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
-from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
 
 
 MIN_UPDATES_TO_COMPILE = 3000
 """With ``compile="auto"`` fewer updates than this run eagerly: compiling costs about as much as they do."""
-
-
-class Replay(NamedTuple):
-    """The replay buffers of both levels."""
-
-    high: OptionReplayBuffer
-    low: SubgoalReplayBuffer
 
 
 class TBCHRL(BaseAlgorithm):
@@ -191,8 +177,14 @@ class TBCHRL(BaseAlgorithm):
         self.high.attach(high_buffer)
         self.low.attach(low_buffer)
         self.policy = TBCPolicy(space, actions, self.high, self.low, self.layout, self.rules, self.memory, seeds[5])
+        self.store = EpisodeStore(
+            self.replay_buffer, self.layout, self.rules, self.high_reward, self._hindsight_settings(), self.rng
+        )
         self.diagnostics = EpisodeDiagnostics()
-        self.hierarchical_env: HierarchicalVecEnv | None = None
+
+    def _hindsight_settings(self) -> HindsightSettings:
+        penalty = -float(self.max_options) if self.testing_penalty is None else self.testing_penalty
+        return HindsightSettings(int(self.n_hindsight_goals), self.goal_strategy, penalty, self.keep_original)
 
     def _check_settings(self) -> None:
         if self.memory not in ("window", "episode", "none"):
@@ -245,11 +237,6 @@ class TBCHRL(BaseAlgorithm):
         scale = np.concatenate([subgoals.local_scale, subgoals.resolution_scale, [1.0]])
         return {"input_scale": scale.tolist(), **circuit}
 
-    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Train on another environment with the same spaces; the unfinished episode is dropped."""
-        super().set_env(env, force_reset)
-        self.hierarchical_env = None
-
     # ------------------------------------------------------------------ learning
 
     def learn(
@@ -272,12 +259,12 @@ class TBCHRL(BaseAlgorithm):
             self._updated_at = 0
         for level in (self.high, self.low):
             level.set_logger(self.logger)
-        self.hierarchical_env = HierarchicalVecEnv(self.env, self._propose, self.layout, self.rules, self.low.state_dim)
-        self._low_observation = self.hierarchical_env.reset()
-        self._membrane = np.zeros((self.n_envs, self.low.state_dim), dtype=np.float32)
+        collector = Collector(
+            self.env, self.high, self.low, self.layout, self.rules, self._exploration(), self.rng, self.policy._unscale
+        )
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
-            if not self.collect_rollouts(callback, total_timesteps):
+            if not self.collect_rollouts(collector, callback, total_timesteps):
                 break
             self.train()
             if log_interval and self._episode_num % log_interval == 0:
@@ -294,92 +281,27 @@ class TBCHRL(BaseAlgorithm):
             if self.verbose and level.compiled:
                 print(f"{level.log_prefix[:-1]} level: update compiled in {seconds:.0f} s")
 
-    def collect_rollouts(self, callback: BaseCallback, total_timesteps: int) -> bool:
-        """Act until an episode is over (or the steps are used up); False if a callback asks to stop."""
-        env = self.hierarchical_env
-        assert env is not None
+    def _exploration(self) -> Exploration:
+        return Exploration(self.random_fraction, self.testing_fraction, self.deterministic_testing, self.memory)
+
+    def collect_rollouts(self, collector: Collector, callback: BaseCallback, total_timesteps: int) -> bool:
+        """Act until an episode is over (or the steps are used up) and store it; False if a callback asks to stop."""
         callback.on_rollout_start()
-        while not env.episodes and self.num_timesteps < total_timesteps:
-            unit = self._act()
-            observation, _, window_over, infos = env.step(self.policy._unscale(unit))
-            self._low_observation = np.asarray(observation)
-            self._forget(window_over, infos)
+        episodes = collector.take_episodes()
+        while not episodes and self.num_timesteps < total_timesteps:
+            infos = collector.step()
+            episodes = collector.take_episodes()
             self.num_timesteps += self.n_envs
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._update_info_buffer(list(infos), np.array(["episode_over" in info for info in infos]))
+            self._update_info_buffer(infos, np.array(["episode_over" in info for info in infos]))
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
-        self._store(env.episodes)
-        env.episodes = []
-        callback.on_rollout_end()
-        return True
-
-    def _propose(self, observations: FloatArray, where: NDArray[np.intp]) -> Proposal:
-        """The exploring high level: mostly SAC samples, sometimes uniform, some of them tests."""
-        n = len(where)
-        unit, _ = self.high.act(observations, np.zeros((n, 0), dtype=np.float32), False, self.rng)
-        uniform = self.rng.random(n) < self.random_fraction
-        if uniform.any():
-            unit[uniform] = self.rng.uniform(-1.0, 1.0, (int(uniform.sum()), unit.shape[1]))
-        return Proposal(unit.astype(np.float64), self.rng.random(n) < self.testing_fraction)
-
-    def _act(self) -> FloatArray:
-        """The exploring low level's unit actions for every environment."""
-        env = self.hierarchical_env
-        assert env is not None
-        before = self._membrane
-        unit, after = self.low.act(self._low_observation, before, False, self.rng)
-        uniform = self.rng.random(self.n_envs) < self.random_fraction
-        if uniform.any():
-            unit[uniform] = self.rng.uniform(-1.0, 1.0, (int(uniform.sum()), unit.shape[1]))
-        if self.deterministic_testing and env.clock.testing.any():
-            tested, _ = self.low.act(self._low_observation, before, True, self.rng)
-            unit = np.where(env.clock.testing[:, None], tested, unit)
-        env.remember(before, after)
-        self._membrane = after
-        return unit
-
-    def _forget(self, window_over: NDArray[np.bool_], infos: Any) -> None:
-        """Reset the membrane where its memory ends."""
-        if not self._membrane.shape[1]:
-            return
-        if self.memory == "none":
-            self._membrane = np.zeros_like(self._membrane)
-        elif window_over.any():
-            over = window_over if self.memory == "window" else np.array(["episode_over" in info for info in infos])
-            self._membrane = np.where(over[:, None], np.float32(0.0), self._membrane)
-
-    def _store(self, episodes: list[Episode]) -> None:
-        settings = HindsightSettings(
-            int(self.n_hindsight_goals),
-            self.goal_strategy,
-            -float(self.max_options) if self.testing_penalty is None else self.testing_penalty,
-            self.keep_original,
-        )
         for episode in episodes:
             self._episode_num += 1
-            self.replay_buffer.low.extend(low_level_steps(episode, self.layout.subgoals, self.rules))
-            options = high_level_steps(
-                episode, self.layout.subgoals, self.rules, self.high_reward, settings, self._goal_test(),
-                self.layout.high, self.rng,
-            )  # fmt: skip
-            self.replay_buffer.high.extend(options)
-            self.diagnostics.add(episode, options)
-
-    def _goal_test(self) -> GoalTest:
-        """The task's own reward and termination, asked of the first environment (as SB3's HER does)."""
-        env = self.env
-        assert env is not None
-
-        def ask(method: str, achieved: FloatArray, desired: FloatArray) -> NDArray[Any]:
-            answer = env.env_method(method, achieved, desired, {}, indices=[0])[0]
-            return np.broadcast_to(np.asarray(answer), (len(achieved),))
-
-        return GoalTest(
-            lambda a, d: ask("compute_reward", a, d).astype(np.float64),
-            lambda a, d: ask("compute_terminated", a, d).astype(bool),
-        )
+            self.diagnostics.add(episode, self.store.add(episode, goal_test_of(collector.env.venv)))
+        callback.on_rollout_end()
+        return True
 
     def train(self) -> None:
         """Update both levels as often as ``gradient_ratio`` and the steps since the last time say."""
@@ -417,8 +339,7 @@ class TBCHRL(BaseAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [
             *super()._excluded_save_params(),
-            "high", "low", "hierarchical_env", "rng", "layout", "rules", "high_reward", "diagnostics",
-            "_low_observation", "_membrane", "replay_buffer",
+            "high", "low", "rng", "layout", "rules", "high_reward", "store", "diagnostics", "replay_buffer",
         ]  # fmt: skip
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -437,19 +358,7 @@ class TBCHRL(BaseAlgorithm):
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write both levels' replay buffers to one file of plain arrays, atomically."""
-        arrays = {
-            f"{name}.{key}": array
-            for name in ("high", "low")
-            for key, array in getattr(self.replay_buffer, name).get_state().items()
-        }
-        if not isinstance(path, (str, pathlib.Path)):
-            np.savez(path, **arrays)
-            return
-        target = pathlib.Path(path)
-        partial = target.with_name(target.name + ".partial")
-        with open(partial, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(partial, target)
+        self.replay_buffer.save(path)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what :meth:`save_replay_buffer` wrote; only plain arrays are read, never pickled objects.
@@ -457,12 +366,7 @@ class TBCHRL(BaseAlgorithm):
         :param truncate_last_traj: for SB3's sake; unfinished episodes are never in the buffers
         :raises ValueError: if the file was written for other spaces or sizes
         """
-        with np.load(path, allow_pickle=False) as arrays:
-            for name in ("high", "low"):
-                state = {
-                    key.removeprefix(f"{name}."): arrays[key] for key in arrays.files if key.startswith(f"{name}.")
-                }
-                getattr(self.replay_buffer, name).set_state(state)
+        self.replay_buffer.load(path)
 
 
 class HiTS(TBCHRL):
