@@ -108,7 +108,8 @@ def describe_goal_env(
     """Subgoal space, scales and episode length of any goal environment.
 
     Subgoals are points of ``achieved_goal``. What is not given comes from the environment: bounds from a finite
-    ``achieved_goal`` Box, else from where achieved and desired goals lie in random episodes, widened by a tenth;
+    ``achieved_goal`` Box, else from where desired goals and nine tenths of the achieved ones lie in random episodes,
+    widened by a tenth;
     thresholds from ``distance_threshold`` (Euclidean), else 5 % of each range; scales from the random episodes.
 
     :param env: a goal environment; random episodes are run in a copy made from its spec, or in it if it has none
@@ -123,7 +124,7 @@ def describe_goal_env(
     check_goal_env(_fresh(env))
     probe = _probe(_fresh(env), n_probe_steps, seed)
     goals = np.concatenate([probe["achieved_goal"], probe["desired_goal"]])
-    low, high = _bounds(env, goals, low, high)
+    low, high = _bounds(env, _extent(probe), low, high)
     within = _contains(probe["observation"], probe["achieved_goal"])
     local = _whole if within else _with_achieved
     dim = len(low)
@@ -154,10 +155,13 @@ def subgoal_space_of(env: gym.Env[Any, Any], **given: Any) -> SubgoalSpace:
 
 
 class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
-    """Gives any goal environment the attributes and ``info["is_success"]`` that our own tasks have.
+    """Gives any goal environment what our own tasks have: attributes, ``info["is_success"]``, rewards 0 and -1.
 
-    :param env: a goal environment with a sparse reward: at least 0 with success, below 0 without
-        (or 1 and 0, as the mazes of Gymnasium-Robotics have it)
+    Rewards are shifted so that the reward where achieved and desired goal coincide becomes 0: the mazes of
+    Gymnasium-Robotics pay 1 and 0, its robots 0 and -1. Success is what ``info`` says under ``is_success`` or
+    ``success``, else that highest reward.
+
+    :param env: a goal environment with a sparse reward
     :param terminate_on_success: end episodes with success, as our own tasks do
     :param given: passed to :func:`describe_goal_env`
     """
@@ -171,20 +175,25 @@ class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
         self.goal_scale = description.goal_scale
         self.max_episode_steps = description.max_episode_steps
         self._terminate_on_success = terminate_on_success
+        self._compute: Any = env.unwrapped.compute_reward  # type: ignore[attr-defined]
+        goal = 0.5 * (self.subgoals.low + self.subgoals.high)
+        self._best = float(self._compute(goal, goal.copy(), {}))
+
+    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+        """The environment's own reward, shifted to 0 at the goal; single or batched."""
+        reward = np.asarray(self._compute(np.asarray(achieved_goal), np.asarray(desired_goal), {})) - self._best
+        return reward if reward.ndim else float(reward)
+
+    def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+        """Whether an episode ends with this achieved goal; single or batched."""
+        return (self.compute_reward(achieved_goal, desired_goal) >= -1e-9) & self._terminate_on_success
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """Step, adding ``is_success``."""
+        """Step; adds ``is_success``, shifts the reward, ends the episode with success."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        if "is_success" not in info:
-            info["is_success"] = info.get("success", float(reward) >= 0)
-        info["is_success"] = bool(info["is_success"])
-        return (
-            observation,
-            reward,
-            bool(terminated or (self._terminate_on_success and info["is_success"])),
-            truncated,
-            info,
-        )
+        reward = float(reward) - self._best
+        info["is_success"] = success = bool(info.get("is_success", info.get("success", reward >= -1e-9)))
+        return observation, reward, bool(terminated or (self._terminate_on_success and success)), truncated, info
 
 
 # -- what describe_goal_env is made of ---------------------------------------------------------------------------------
@@ -218,13 +227,23 @@ def _probe(env: gym.Env[Any, Any], n_steps: int, seed: int) -> dict[str, NDArray
     return {key: np.stack([observation[key] for observation in seen]).astype(np.float64) for key in GOAL_KEYS}
 
 
+def _extent(probe: dict[str, NDArray[np.float64]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least and largest desired goal or, farther out, 5 % and 95 % quantile of the achieved goals."""
+    achieved, desired = probe["achieved_goal"], probe["desired_goal"]
+    low, high = np.quantile(achieved, (0.05, 0.95), axis=0)
+    return np.minimum(low, desired.min(axis=0)), np.maximum(high, desired.max(axis=0))
+
+
 def _bounds(
-    env: gym.Env[Any, Any], goals: NDArray[np.float64], low: ArrayLike | None, high: ArrayLike | None
+    env: gym.Env[Any, Any],
+    extent: tuple[NDArray[np.float64], NDArray[np.float64]],
+    low: ArrayLike | None,
+    high: ArrayLike | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     assert isinstance(env.observation_space, spaces.Dict)
     box = env.observation_space["achieved_goal"]
     assert isinstance(box, spaces.Box)
-    least, most = goals.min(axis=0), goals.max(axis=0)
+    least, most = extent
     margin = np.maximum(0.1 * (most - least), 1e-3)
     declared_low = np.where(np.isfinite(box.low), box.low, least - margin)
     declared_high = np.where(np.isfinite(box.high), box.high, most + margin)

@@ -150,6 +150,21 @@ def test_wrapper_adds_success_and_ends_episodes():
     assert patient.step(np.zeros(2))[2] is False
 
 
+def test_wrapper_brings_rewards_to_zero_and_minus_one():
+    class Paying(Point):
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return 1.0 + super().compute_reward(achieved_goal, desired_goal, info)
+
+    env = DescribedGoalEnv(Paying())
+    env.reset(seed=0)
+    assert env.step(np.zeros(2))[1] == -1.0
+    goals = np.array([[0.0, 0.0], [0.0, 0.0]]), np.array([[0.1, 0.0], [1.0, 0.0]])
+    np.testing.assert_array_equal(env.compute_reward(*goals, {}), [0.0, -1.0])
+    np.testing.assert_array_equal(env.compute_terminated(*goals, {}), [True, False])
+    assert env.compute_reward(goals[0][0], goals[1][1], {}) == -1.0
+    assert not DescribedGoalEnv(Paying(), terminate_on_success=False).compute_terminated(*goals, {}).any()
+
+
 def test_a_maze_of_gymnasium_robotics():
     import gymnasium_robotics
 
@@ -159,4 +174,5 @@ def test_a_maze_of_gymnasium_robotics():
     assert env.achieved_in_observation
     assert env.max_episode_steps == 300
     env.reset(seed=0)
-    assert "is_success" in env.step(env.action_space.sample())[4]
+    _, reward, _, _, info = env.step(env.action_space.sample())
+    assert (reward, info["is_success"]) == (-1.0, False)
