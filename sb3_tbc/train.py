@@ -13,6 +13,7 @@ from typing import Any
 import torch as th
 
 from sb3_tbc.cli import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.zoo.algorithms import algorithm
 from sb3_tbc.zoo.config import CONFIGS, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env
@@ -28,8 +29,9 @@ def build_parser() -> Parser:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--n-timesteps", type=positive_int, help="environment steps; by default the paper's (table 1)")
     parser.add_argument("--n-envs", type=positive_int, help="parallel environments")
-    parser.add_argument("--config", choices=CONFIGS, help="the paper's values, or those tuned by measurement (default)")
-    parser.add_argument("--config-file", type=Path, help="another file with sections like those of zoo_configs")
+    parser.add_argument("--config", metavar="{paper,tuned,FILE.yml}", help="the paper's values, those tuned by "
+                        "measurement (default), or a file with sections like those of zoo_configs")  # fmt: skip
+    parser.add_argument("--config-file", type=Path, help="the file, where paper or tuned is said too")
     parser.add_argument("--ablation", help="what to leave out: no-ts or no-ndbc")
     parser.add_argument("--hyperparams", nargs="+", default=[], metavar="K:V", help="e.g. low.learning_rate:1e-3")
     parser.add_argument("--eval-freq", type=positive_int, help="environment steps between evaluations")
@@ -60,17 +62,33 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
     algorithm(args.algo)
     task, env_id = resolve_env(args.env)
     overrides = parse_overrides(args.hyperparams)
-    run = load_config(args.algo, task, args.config, overrides, args.ablation, args.config_file)
+    config, file = config_and_file(args)
+    run = load_config(args.algo, task, config, overrides, args.ablation, file)
     run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
     return RunSpec(
         run,
         env_id,
-        variant=args.variant or variant_name(args.ablation, args.config),
+        variant=args.variant or variant_name(args.ablation, config),
         seed=args.seed,
         eval_freq=args.eval_freq or max(run.n_timesteps // 40, 500),
         n_eval_episodes=args.n_eval_episodes,
         n_final_episodes=args.n_final_episodes,
     )
+
+
+def config_and_file(args: argparse.Namespace) -> tuple[str | None, Path | None]:
+    """``paper`` or ``tuned``, and the file: ``--config`` takes either.
+
+    :raises ConfigError: if it is neither, or a second file
+    """
+    if args.config is None or args.config in CONFIGS:
+        return args.config, args.config_file
+    path = Path(args.config)
+    if path.suffix not in (".yml", ".yaml"):
+        raise ConfigError(f"--config is {', '.join(CONFIGS)} or a .yml file, got {args.config!r}")
+    if args.config_file is not None:
+        raise ConfigError(f"--config {path} and --config-file {args.config_file} name two files; give one")
+    return None, path
 
 
 def variant_name(ablation: str | None, config: str | None) -> str:

@@ -125,10 +125,16 @@ class Interrupted(Exception):
 
 
 def start_run(
-    spec: RunSpec, folder: RunFolder, command: str, options: RunOptions, overwrite: bool = False
+    spec: RunSpec,
+    folder: RunFolder,
+    command: str,
+    options: RunOptions,
+    overwrite: bool = False,
+    after_eval: BaseCallback | None = None,
 ) -> dict[str, Any]:
     """Train from the beginning and return the content of ``final.json``.
 
+    :param after_eval: called after each evaluation, e.g. by a search that may give the run up
     :raises ConfigError: for a user's mistake, before anything is written, and if the folder holds a run
     :raises Interrupted: after Ctrl-C, when the checkpoint is written
     """
@@ -143,7 +149,7 @@ def start_run(
         model = build_model(spec.run, env, spec.seed, device=options.device)
         folder.clear()
         folder.start(spec.to_dict(), command)
-        return _learn(model, spec, folder, options, earlier=0.0)
+        return _learn(model, spec, folder, options, earlier=0.0, after_eval=after_eval)
     finally:
         env.close()
 
@@ -183,7 +189,14 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
         env.close()
 
 
-def _learn(model: TBCHRL, spec: RunSpec, folder: RunFolder, options: RunOptions, earlier: float) -> dict[str, Any]:
+def _learn(
+    model: TBCHRL,
+    spec: RunSpec,
+    folder: RunFolder,
+    options: RunOptions,
+    earlier: float,
+    after_eval: BaseCallback | None = None,
+) -> dict[str, Any]:
     setattr(model, RUN_INFO, spec.identity)
     formats = ["csv", "tensorboard"] if options.tensorboard else ["csv"]
     model.set_logger(configure(str(folder.path), formats))
@@ -196,6 +209,7 @@ def _learn(model: TBCHRL, spec: RunSpec, folder: RunFolder, options: RunOptions,
         csv_path=folder.evaluations,
         best_model_path=folder.best_model,
         wall_time=earlier,
+        callback_after_eval=after_eval,
         verbose=options.verbose,
     )
 
