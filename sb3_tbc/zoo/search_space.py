@@ -6,6 +6,7 @@ Nothing here imports Optuna: a space is data, and a trial is whatever has ``sugg
 from __future__ import annotations
 
 import fnmatch
+import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -130,6 +131,9 @@ def read_key(run: RunConfig, key: str) -> Any:
         value = value.get(name) if isinstance(value, Mapping) else None
     if value is None and len(rest) == 1 and first in ("low", "high"):
         value = run.model.get(rest[0], LEVEL_DEFAULTS.get(rest[0]))
+    if value is None and not rest and first not in run.model:
+        known = inspect.signature(algorithm(run.algo)).parameters
+        value = known[first].default if first in known else None
     return value
 
 
