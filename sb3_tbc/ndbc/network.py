@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from sb3_tbc.ndbc.cell import ConductanceCell
 from sb3_tbc.ndbc.dissipative import Certificate, DissipativeCell
-from sb3_tbc.ndbc.sequence import unroll
+from sb3_tbc.ndbc.sequence import Unrolled, unroll
 from sb3_tbc.ndbc.stepping import LipschitzProxy, StepRule, advance_checked
 from sb3_tbc.ndbc.wiring import NDBCWiring
 
@@ -125,6 +125,10 @@ class NDBCNet(nn.Module):
         if inputs.dim() == 2:
             state = self._advance(inputs, state, mask, interval)
             return self.read(state), state
+        fast = self._unroll_fast(inputs, state, mask, interval)
+        if fast is not None:
+            weight = functional.pad(self.readout_weight, (self.read_from, 0))
+            return fast.read(weight, self.readout_bias), fast.last()
         trace = self.unroll(inputs, state, mask, interval)
         return self.read(trace), trace[:, -1]
 
@@ -140,17 +144,27 @@ class NDBCNet(nn.Module):
         interval: th.Tensor | None = None,
     ) -> th.Tensor:
         """Potentials after every step of a sequence, ``(batch, time, state_dim)``; arguments as in :meth:`forward`."""
-        self._check_shapes(inputs, state, mask, interval, dims=3)
+        fast = self._unroll_fast(inputs, state, mask, interval)
+        if fast is not None:
+            return fast.potentials()
         state = self.initial_state(inputs.shape[0]) if state is None else state
-        checked = self.step_rule is not None and self.step_rule.half_step_check
-        if isinstance(self.cell, ConductanceCell) and interval is None and not checked:
-            return unroll(self.cell, self.cell.arrays(), inputs * self.input_gain, state, mask, self.sub_steps)
         trace = []
         for t in range(inputs.shape[1]):
             mask_t, interval_t = (None if x is None else x[:, t] for x in (mask, interval))
             state = self._advance(inputs[:, t], state, mask_t, interval_t)
             trace.append(state)
         return th.stack(trace, dim=1)
+
+    def _unroll_fast(
+        self, inputs: th.Tensor, state: th.Tensor | None, mask: th.Tensor | None, interval: th.Tensor | None
+    ) -> Unrolled | None:
+        """A sequence through the node of its own; None for what that cannot do."""
+        self._check_shapes(inputs, state, mask, interval, dims=3)
+        checked = self.step_rule is not None and self.step_rule.half_step_check
+        if not isinstance(self.cell, ConductanceCell) or interval is not None or checked:
+            return None
+        state = self.initial_state(inputs.shape[0]) if state is None else state
+        return unroll(self.cell, inputs, self.input_gain, state, mask, self.sub_steps)
 
     def _advance(
         self, inputs: th.Tensor, state: th.Tensor | None, mask: th.Tensor | None, interval: th.Tensor | None

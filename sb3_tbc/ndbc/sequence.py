@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-from sb3_tbc.ndbc.cell import ConductanceArrays, ConductanceCell
+from sb3_tbc.ndbc.cell import ConductanceCell
 
 
 class UnrolledCell(th.autograd.Function):
@@ -30,9 +30,9 @@ class UnrolledCell(th.autograd.Function):
         pace: th.Tensor,
         sub_steps: int,
     ) -> th.Tensor:
-        """Logistic arguments after every control step, ``(time, N, batch)``.
+        """Logistic arguments after every control step, ``(N, time, batch)``.
 
-        :param drive: constant part of numerator | denominator, ``(time, 2 N, batch)``
+        :param drive: constant part of numerator | denominator, ``(2 N, time, batch)``
         :param state: logistic arguments to start from, ``(N, batch)``
         :param mask: 0 where the state is reset before a step, ``(time, batch)``, or None
         :param rest: logistic arguments of potential zero, ``(N, 1)``
@@ -43,7 +43,7 @@ class UnrolledCell(th.autograd.Function):
         saved = []
         trace = []
         presynaptic = recurrent.shape[1]
-        for t, drive_t in enumerate(drive.unbind(0)):
+        for t, drive_t in enumerate(drive.unbind(1)):
             if mask is not None:
                 state = rest + (state - rest) * mask[t]
             saved.append(state)
@@ -55,7 +55,7 @@ class UnrolledCell(th.autograd.Function):
             trace.append(state)
         ctx.sub_steps, ctx.has_mask = sub_steps, mask is not None
         ctx.save_for_backward(recurrent, pace, *([] if mask is None else [mask]), *saved)
-        return th.stack(trace)
+        return th.stack(trace, dim=1)
 
     @staticmethod
     @once_differentiable
@@ -64,11 +64,12 @@ class UnrolledCell(th.autograd.Function):
         recurrent, pace, *saved = ctx.saved_tensors
         mask = saved.pop(0) if ctx.has_mask else None
         k, presynaptic, back = ctx.sub_steps, recurrent.shape[1], recurrent.t().contiguous()
-        grad_state = th.zeros_like(grad[0])
+        steps_of_time = grad.unbind(1)
+        grad_state = th.zeros_like(steps_of_time[0])
         grad_pace, grad_rest = th.zeros_like(grad_state), th.zeros_like(grad_state)
         grad_recurrent, grad_drive = th.zeros_like(recurrent), []
-        for t in reversed(range(len(grad))):
-            grad_state = grad_state + grad[t]
+        for t in reversed(range(len(steps_of_time))):
+            grad_state = grad_state + steps_of_time[t]
             before, *steps = saved[t * (3 * k + 1) : (t + 1) * (3 * k + 1)]
             pulls = th.zeros(0)
             for s in reversed(range(k)):
@@ -88,48 +89,71 @@ class UnrolledCell(th.autograd.Function):
                 grad_state = grad_state * mask[t]
         grad_drive.reverse()
         grad_rest, grad_pace = grad_rest.sum(dim=1, keepdim=True), grad_pace.sum(dim=1, keepdim=True)
-        return th.stack(grad_drive), grad_state, None, grad_rest, grad_recurrent, grad_pace, None
+        return th.stack(grad_drive, dim=1), grad_state, None, grad_rest, grad_recurrent, grad_pace, None
+
+
+class Unrolled(NamedTuple):
+    """A sequence's states as logistic arguments ``z = gain V - threshold``, batch last."""
+
+    arguments: th.Tensor  # (N, time, batch)
+    gain: th.Tensor  # (N,); one where a neuron projects nowhere and has no logistic
+    threshold: th.Tensor  # (N,); zero there
+
+    def potentials(self) -> th.Tensor:
+        """Potentials after every control step, ``(batch, time, N)``."""
+        return (self.arguments.permute(2, 1, 0) + self.threshold) / self.gain
+
+    def last(self) -> th.Tensor:
+        """Potentials after the last step, ``(batch, N)``."""
+        return (self.arguments[:, -1].t() + self.threshold) / self.gain
+
+    def read(self, weight: th.Tensor, bias: th.Tensor) -> th.Tensor:
+        """``weight V + bias`` for weights ``(outputs, N)``, ``(batch, time, outputs)``."""
+        _, time, batch = self.arguments.shape
+        scaled = weight / self.gain
+        shift = bias + scaled @ self.threshold
+        outputs = th.addmm(shift.unsqueeze(-1), scaled, self.arguments.flatten(1))
+        return outputs.view(-1, time, batch).permute(2, 1, 0)
 
 
 def unroll(
     cell: ConductanceCell,
-    arrays: ConductanceArrays,
     inputs: th.Tensor,
+    input_gain: th.Tensor,
     state: th.Tensor,
     mask: th.Tensor | None,
     sub_steps: int,
-) -> th.Tensor:
-    """Potentials after every control step, ``(batch, time, N)``.
+) -> Unrolled:
+    """Run a sequence.
 
     :param cell: the cell
-    :param arrays: from ``cell.arrays()``
-    :param inputs: scaled inputs, ``(batch, time, n_inputs)``
+    :param inputs: ``(batch, time, n_inputs)``
+    :param input_gain: what inputs are multiplied by, ``(n_inputs,)``
     :param state: potentials to start from, ``(batch, N)``
     :param mask: 0 where potentials are reset before a step, ``(batch, time)``, or None
     :param sub_steps: K, sub-steps per control step
     """
-    n = cell.n_neurons
-    silent = n - len(arrays.gain)  # the last neurons may project nowhere: their logistic is the identity's stand-in
-    gain, threshold = functional.pad(arrays.gain, (0, silent), value=1.0), functional.pad(cell.threshold, (0, silent))
+    arrays, n = cell.arrays(), cell.n_neurons
+    batch, time, _ = inputs.shape
+    silent = n - cell.n_presynaptic
+    gain = functional.pad(arrays.gain, (0, silent), value=1.0)
+    threshold = functional.pad(cell.threshold, (0, silent))
 
     def fold(matrix: th.Tensor) -> th.Tensor:
-        """From numerators of V to numerators of z: ``gain x numerator - threshold x denominator``."""
+        """From numerators of V to numerators of z: ``gain x numerator - threshold x denominator``; transposed."""
         weighted, total = matrix.chunk(2, dim=-1)
-        return th.cat((weighted * gain - total * threshold, total), dim=-1).transpose(-1, -2)
+        return th.cat((weighted * gain - total * threshold, total), dim=-1).t()
 
+    # One tanh for sensory neurons and input currents: the logistic is (1 + tanh(x / 2)) / 2, halves in the matrices.
+    excite = th.cat((th.diag(0.5 * arrays.sensory_gain), arrays.current_weight), dim=1) * input_gain.unsqueeze(-1)
+    shift = th.cat((-0.5 * cell.sensory_threshold, cell.current_bias)).unsqueeze(-1)
+    sources = th.tanh(th.addmm(shift, excite.t(), inputs.permute(2, 1, 0).reshape(cell.n_inputs, -1)))
+    sensory, current = th.split(arrays.from_inputs, [cell.n_inputs, cell.n_inter])
     pace = arrays.capacitance * sub_steps
-    constant = fold(arrays.rest.unsqueeze(0))
-    sources = _sources(cell, arrays, inputs.permute(1, 2, 0).contiguous())
-    drive = fold(arrays.from_inputs) @ sources + (constant + functional.pad(pace, (n, 0)).unsqueeze(-1))
+    rest = fold((arrays.rest + 0.5 * sensory.sum(dim=0)).unsqueeze(0)) + functional.pad(pace, (n, 0)).unsqueeze(-1)
+    drive = th.addmm(rest, fold(th.cat((0.5 * sensory, current))), sources).view(2 * n, time, batch)
     arguments = UnrolledCell.apply(  # type: ignore[no-untyped-call]
         drive, (state * gain - threshold).t(), None if mask is None else mask.t(), -threshold.unsqueeze(-1),
         fold(arrays.recurrent), pace.unsqueeze(-1), sub_steps,
     )  # fmt: skip
-    return (arguments.permute(2, 0, 1) + threshold) / gain  # type: ignore[no-any-return]
-
-
-def _sources(cell: ConductanceCell, arrays: ConductanceArrays, inputs: th.Tensor) -> th.Tensor:
-    """What sensory neurons release and the potentials of the input currents, ``(time, n_inputs + n_inter, batch)``."""
-    sensed = th.sigmoid(inputs * arrays.sensory_gain.unsqueeze(-1) - cell.sensory_threshold.unsqueeze(-1))
-    current = th.tanh(arrays.current_weight.t() @ inputs + cell.current_bias.unsqueeze(-1))
-    return th.cat((sensed, current), dim=1)
+    return Unrolled(arguments, gain, threshold)
