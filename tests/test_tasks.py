@@ -9,6 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from making import ENGINES, make
 from sb3_tbc.tasks import TASKS
 from scripted_policies import Roll, episode_length, sail_late, servo
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
@@ -33,10 +34,6 @@ EPISODE_STEPS = {
 SIX = sorted(STATE_SIZE)
 layouts = pytest.mark.parametrize("layout", ["paper", "compact"])
 tasks = pytest.mark.parametrize("task", SIX)
-
-
-def make(task, layout="paper", **kwargs):
-    return gym.make(f"sb3_tbc/{task}-v0", observation=layout, **kwargs)
 
 
 def random_actions(env, n, seed=0):
@@ -320,3 +317,25 @@ def test_importing_the_package_stays_light():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.strip().endswith("[]")
+
+
+@pytest.mark.parametrize(
+    ("task", "module", "extra"),
+    [("Platforms", "Box2D", "box2d"), ("Tennis2D", "Box2D", "box2d"), ("UR5ReacherBullet", "pybullet", "bullet")],
+)
+def test_missing_engine_names_the_extra(task, module, extra, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ImportError, match=rf"pip install 'sb3_tbc\[{extra}\]'"):
+        gym.make(f"sb3_tbc/{task}-v0")
+
+
+@tasks
+def test_vector_environments(task):
+    if task in ENGINES:
+        pytest.importorskip(ENGINES[task])
+    envs = gym.make_vec(f"sb3_tbc/{task}-v0", num_envs=2, vectorization_mode="sync")
+    observations, _ = envs.reset(seed=3)
+    assert observations["observation"].shape == (2, *envs.single_observation_space["observation"].shape)
+    rewards = envs.step(envs.action_space.sample())[1]
+    assert rewards.shape == (2,)
+    envs.close()

@@ -2,11 +2,9 @@
 
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
-
-import sb3_tbc  # noqa: F401  (registers the tasks)
+from making import make
 
 GOLDEN = Path(__file__).parent / "data" / "golden"
 
@@ -54,28 +52,28 @@ def replay(env, episode):
 @pytest.mark.parametrize("layout", ["paper", "compact"])
 @pytest.mark.parametrize("task", ["Drawbridge", "Platforms", "Tennis2D"])
 def test_two_dimensional_tasks_are_exact(task, layout):
-    env = gym.make(f"sb3_tbc/{task}-v0", observation=layout, legacy_quirks=True)
+    env = make(task, layout, legacy_quirks=True)
     for name, episode in load(task).items():
         if name != "consecutive_ep1":  # the one that goes on where another ended
-            env = gym.make(f"sb3_tbc/{task}-v0", observation=layout, legacy_quirks=True)
+            env = make(task, layout, legacy_quirks=True)
         assert replay(env, episode).max() == 0.0, name
 
 
 def test_drawbridge_is_exact_by_default():
     for episode in load("Drawbridge").values():
-        assert replay(gym.make("sb3_tbc/Drawbridge-v0"), episode).max() == 0.0
+        assert replay(make("Drawbridge"), episode).max() == 0.0
 
 
 @pytest.mark.parametrize("legacy_quirks", [False, True])
 def test_pendulum(legacy_quirks):
     for name, episode in load("Pendulum").items():
-        env = gym.make("sb3_tbc/Pendulum-v0", legacy_quirks=legacy_quirks)
+        env = make("Pendulum", legacy_quirks=legacy_quirks)
         assert replay(env, episode).max() < 1e-9, name
 
 
 @pytest.mark.parametrize("layout", ["paper", "compact"])
 def test_ant_four_rooms_replays_exactly(layout):
-    env = gym.make("sb3_tbc/AntFourRooms-v0", observation=layout)
+    env = make("AntFourRooms", layout)
     for name, episode in load("AntFourRooms").items():
         assert replay(env, episode).max() < 1e-12, name
 
@@ -83,14 +81,14 @@ def test_ant_four_rooms_replays_exactly(layout):
 def test_ur5_off_the_floor():
     episodes = load("UR5Reacher")
     for name in ("ep1", "ep3"):
-        assert replay(gym.make("sb3_tbc/UR5Reacher-v0"), episodes[name]).max() < 1e-6, name
+        assert replay(make("UR5Reacher"), episodes[name]).max() < 1e-6, name
 
 
 def test_ur5_on_the_floor_stays_close():
     """Primitives stand for the collision meshes: after 200 actions on the floor the angles differ by 0.07 and 0.005."""
     for name in ("ep0", "ep2"):
         episode = load("UR5Reacher")[name]
-        env = gym.make("sb3_tbc/UR5Reacher-v0", observation="compact")
+        env = make("UR5Reacher", "compact")
         observation, _ = env.reset(options=start_of(episode))
         for action in episode["action"][:200]:
             observation = env.step(action)[0]
@@ -101,7 +99,7 @@ def test_ur5_on_the_floor_stays_close():
 def test_default_differs_from_legacy_only_where_documented():
     """Without the public quirks the platforms stand at their start, not at the origin."""
     episode = load("Platforms")["ep1"]
-    env = gym.make("sb3_tbc/Platforms-v0", observation="compact")
+    env = make("Platforms", "compact")
     observation, _ = env.reset(options=start_of(episode))
     platform0 = observation["observation"][1:5]
     np.testing.assert_allclose(

@@ -1,17 +1,11 @@
 """Stress variants: off by default, seeded, and each disturbs what it says."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from making import make
 from sb3_tbc.tasks.perturb import Perturb
 
-import sb3_tbc  # noqa: F401  (registers the tasks)
-
 SIX = ["AntFourRooms", "Drawbridge", "Pendulum", "Platforms", "Tennis2D", "UR5Reacher"]
-
-
-def make(task, **kwargs):
-    return gym.make(f"sb3_tbc/{task}-v0", **kwargs)
 
 
 def trace(env, n=20, seed=0, action_seed=0):

@@ -4,33 +4,33 @@ import importlib
 import sys
 import types
 
-import gymnasium as gym
 import numpy as np
 import pytest
+from making import make
 from sb3_tbc.tasks import mujoco_rendering
 from sb3_tbc.tasks.rendering import BODY, GOAL, PAPER, SUBGOAL, Canvas
 from sb3_tbc.tasks.window import Window
-
-import sb3_tbc  # noqa: F401  (registers the tasks)
 
 PLANAR = ["Pendulum", "Drawbridge", "Platforms", "Tennis2D"]
 SPATIAL = ["UR5Reacher", "AntFourRooms"]
 
 
-def render(task, **overlay):
-    env = gym.make(f"sb3_tbc/{task}-v0", render_mode="rgb_array")
+def render(task, *overlays):
+    """One picture per overlay; drawing must not touch the state."""
+    env = make(task, render_mode="rgb_array")
     env.reset(seed=0)
     for _ in range(3):
         env.step(np.zeros(env.action_space.shape))
-    state = env.unwrapped.task_state()
-    env.unwrapped.set_overlay(**overlay)
-    try:
-        picture = env.render()
-    except mujoco_rendering.GLUnavailable as error:
-        pytest.skip(str(error))
+    state, pictures = env.unwrapped.task_state(), []
+    for overlay in overlays:
+        env.unwrapped.set_overlay(**overlay)
+        try:
+            pictures.append(env.render())
+        except mujoco_rendering.GLUnavailable as error:
+            pytest.skip(str(error))
     assert all(np.array_equal(state[key], value, equal_nan=True) for key, value in env.unwrapped.task_state().items())
     env.close()
-    return picture
+    return pictures
 
 
 def count(picture, color, tolerance=12):
@@ -39,16 +39,16 @@ def count(picture, color, tolerance=12):
 
 @pytest.mark.parametrize("task", PLANAR + SPATIAL)
 def test_picture_shows_subgoal_and_time(task):
-    bare = render(task)
+    space = make(task).unwrapped.subgoals
+    subgoal = space.unscale(np.full(space.dim, 0.5))
+    with_subgoal = [{"subgoal": subgoal, "time_left": left} for left in (1.0, 0.1)]
+    bare, full, late = render(task, {}, *with_subgoal)
     assert bare.dtype == np.uint8
     assert bare.ndim == 3
     assert bare.shape[2] == 3
     assert len(np.unique(bare.reshape(-1, 3), axis=0)) > 5
     assert count(bare, GOAL) > 100
     assert count(bare, SUBGOAL) == 0
-    space = gym.make(f"sb3_tbc/{task}-v0").unwrapped.subgoals
-    subgoal = space.unscale(np.full(space.dim, 0.5))
-    full, late = render(task, subgoal=subgoal, time_left=1.0), render(task, subgoal=subgoal, time_left=0.1)
     ring = slice(0, 64), slice(bare.shape[1] - 64, None)
     assert count(full[ring], SUBGOAL) > 3 * count(late[ring], SUBGOAL) > 0
     changed = (full.astype(int) - bare).any(axis=-1)
@@ -58,7 +58,7 @@ def test_picture_shows_subgoal_and_time(task):
 def test_rendering_changes_nothing():
     """Episodes with and without pictures agree to the bit."""
     for task in [*PLANAR, "AntFourRooms"]:
-        seen, unseen = gym.make(f"sb3_tbc/{task}-v0", render_mode="rgb_array"), gym.make(f"sb3_tbc/{task}-v0")
+        seen, unseen = make(task, render_mode="rgb_array"), make(task)
         seen.reset(seed=1)
         unseen.reset(seed=1)
         seen.action_space.seed(0)
@@ -98,7 +98,7 @@ def test_box_turned_by_nothing_equals_polygon():
 
 
 def test_render_without_mode_warns_and_returns_nothing():
-    env = gym.make("sb3_tbc/Pendulum-v0")
+    env = make("Pendulum")
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode"):
         assert env.render() is None
@@ -108,7 +108,7 @@ def test_missing_opengl_says_what_to_install(monkeypatch):
     monkeypatch.setattr(
         mujoco_rendering, "import_module", lambda name: (_ for _ in ()).throw(ImportError(f"no {name}"))
     )
-    env = gym.make("sb3_tbc/UR5Reacher-v0", render_mode="rgb_array")
+    env = make("UR5Reacher", render_mode="rgb_array")
     env.reset(seed=0)
     with pytest.raises(mujoco_rendering.GLUnavailable, match=r"apt-get install libegl1.*no mujoco\.egl"):
         env.render()
@@ -122,7 +122,7 @@ def test_human_mode_without_display_says_what_to_do(monkeypatch):
 
     tk.Tk = no_display
     monkeypatch.setitem(sys.modules, "tkinter", tk)
-    env = gym.make("sb3_tbc/Drawbridge-v0", render_mode="human")
+    env = make("Drawbridge", render_mode="human")
     with pytest.raises(RuntimeError, match="rgb_array"):
         env.reset()
 
@@ -146,7 +146,7 @@ def test_human_mode_shows_each_step(monkeypatch):
     tk.PhotoImage = photo
     monkeypatch.setitem(sys.modules, "tkinter", tk)
     importlib.import_module("sb3_tbc.tasks.window")
-    env = gym.make("sb3_tbc/Drawbridge-v0", render_mode="human")
+    env = make("Drawbridge", render_mode="human")
     env.reset()
     env.step(np.zeros(1))
     assert len(shown) == 2
