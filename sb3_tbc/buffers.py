@@ -1,128 +1,50 @@
-"""Replay buffers of the two levels: preallocated float32 rings that give whole bursts of batches at once."""
+"""Replay buffers of the two levels."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.buffers import BaseBuffer
-from stable_baselines3.common.type_aliases import ReplayBufferSamples
-from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_tbc.errors import HierarchyError
 from sb3_tbc.hindsight import HighLevelSteps, LowLevelSteps, ordered_pairs
 from sb3_tbc.layout import LevelLayout
+from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import OptionRules
+from sb3_tbc.ring_buffer import Float32, RingBuffer
+from sb3_tbc.spaces import SubgoalSpace
 from sb3_tbc.type_aliases import LevelBatch
 
-Float32 = NDArray[np.float32]
+Teacher = Callable[[Float32, Float32, Float32], Float32]
+"""Maps high-level observations, local states and subgoal-space points to unit time budgets to imitate, ``(n,)``."""
+
+Advance = Callable[[Float32, Float32], Float32]
+"""Maps low-level observations and memory states to the next states, from the current weights."""
+
+HINDSIGHT_SUBGOALS = ("timed", "future", "episode")
 
 
-class RingBuffer(BaseBuffer):
-    """A ring of rows, one array per quantity, that grows up to ``buffer_size`` as it fills.
+class ReachPairs(NamedTuple):
+    """Visited states and points visited later in the same episode."""
 
-    SB3's ``SAC.train`` can sample from it as from any replay buffer; :meth:`sample_burst` is the fast way.
-
-    :param buffer_size: rows to keep; the oldest are overwritten
-    :param seed: seed of the sampling
-    """
-
-    def __init__(
-        self,
-        buffer_size: int,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
-        widths: Mapping[str, int],
-        device: th.device | str = "cpu",
-        seed: int | None = None,
-    ) -> None:
-        super().__init__(buffer_size, observation_space, action_space, device, n_envs=1)
-        self.rng = np.random.default_rng(seed)
-        self.data = {name: np.zeros((0, width), dtype=np.float32) for name, width in widths.items()}
-
-    def size(self) -> int:
-        """Number of rows stored."""
-        return self.buffer_size if self.full else self.pos
-
-    def add(self, *args: Any, **kwargs: Any) -> None:
-        """Refused: rows come in whole episodes.
-
-        :raises TypeError: always, naming the method to use
-        """
-        raise TypeError(f"{type(self).__name__} takes whole episodes: use extend(rows)")
-
-    def _extend(self, rows: Mapping[str, NDArray[Any]]) -> None:
-        count = len(next(iter(rows.values())))
-        if count > self.buffer_size:
-            raise ValueError(
-                f"an episode of {count} rows does not fit a buffer of {self.buffer_size}; raise buffer_size"
-            )
-        self._reserve(min(self.pos + count, self.buffer_size))
-        at = (self.pos + np.arange(count)) % self.buffer_size
-        for name, array in self.data.items():
-            array[at] = np.asarray(rows[name], dtype=np.float32).reshape(count, array.shape[1])
-        self.full = self.full or self.pos + count >= self.buffer_size
-        self.pos = (self.pos + count) % self.buffer_size
-
-    def _reserve(self, rows: int) -> None:
-        held = len(next(iter(self.data.values())))
-        if rows > held:
-            room = min(max(rows, 2 * held, 4096), self.buffer_size)
-            for name, array in self.data.items():
-                grown = np.zeros((room, array.shape[1]), dtype=np.float32)
-                grown[:held] = array
-                self.data[name] = grown
-
-    def sample_burst(self, gradient_steps: int, batch_size: int) -> LevelBatch:
-        """Independent uniform batches for ``gradient_steps`` updates, tensors ``(gradient_steps, batch_size, .)``."""
-        flat = self._rows(self.rng.integers(0, self.size(), gradient_steps * batch_size))
-        return LevelBatch(*(th.from_numpy(part).view(gradient_steps, batch_size, -1).to(self.device) for part in flat))
-
-    def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
-        """One batch in SB3's form."""
-        batch = LevelBatch(*(part[0] for part in self.sample_burst(1, batch_size)))
-        return ReplayBufferSamples(
-            batch.observations, batch.actions, batch.next_observations, batch.dones, batch.rewards, batch.discounts
-        )
-
-    def _get_samples(self, batch_inds: NDArray[np.intp], env: VecNormalize | None = None) -> ReplayBufferSamples:
-        parts = LevelBatch(*(th.from_numpy(part).to(self.device) for part in self._rows(batch_inds)))
-        return ReplayBufferSamples(
-            parts.observations, parts.actions, parts.next_observations, parts.dones, parts.rewards, parts.discounts
-        )
-
-    def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
-        raise NotImplementedError
-
-    def get_state(self) -> dict[str, NDArray[Any]]:
-        """The stored rows and the position, as plain arrays."""
-        held = {name: array[: self.size()] for name, array in self.data.items()}
-        return {**held, "pos": np.array(self.pos), "full": np.array(self.full)}
-
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Take over rows saved by :meth:`get_state`.
-
-        :raises ValueError: if they have other quantities or widths than this buffer
-        """
-        for name, array in self.data.items():
-            if name not in state or state[name].shape[1:] != array.shape[1:]:
-                got = state[name].shape if name in state else "nothing"
-                raise ValueError(f"saved replay buffer does not fit: {name} has width {array.shape[1]}, got {got}")
-        rows = len(state[next(iter(self.data))])
-        if rows > self.buffer_size:
-            raise ValueError(f"saved replay buffer has {rows} rows, this one has room for {self.buffer_size}")
-        self._reserve(rows)
-        for name, array in self.data.items():
-            array[:rows] = state[name]
-        self.full = bool(state["full"]) and rows == self.buffer_size
-        self.pos = int(state["pos"]) if rows == self.buffer_size else rows % self.buffer_size
+    local: Float32  # (n, local_dim), what the low level saw
+    here: Float32  # (n, subgoal_dim), where it was
+    goal: Float32  # (n, subgoal_dim), where it was later
+    steps: Float32  # (n,), how many steps later
 
 
 class OptionReplayBuffer(RingBuffer):
-    """The high level's SMDP transitions; ``discounts`` carries ``gamma ** duration`` (SB3 reads it per sample)."""
+    """The high level's SMDP transitions; ``discounts`` carries ``gamma ** duration`` (SB3 reads it per sample).
+
+    :param context: also keep what a teacher of time budgets needs of each option's first state
+    """
+
+    teacher: Teacher | None = None
+    """Gives the labels of :meth:`sample_labelled`."""
 
     def __init__(
         self,
@@ -131,6 +53,7 @@ class OptionReplayBuffer(RingBuffer):
         action_space: spaces.Box,
         device: th.device | str = "cpu",
         seed: int | None = None,
+        context: SubgoalSpace | None = None,
     ) -> None:
         observation, action = observation_space.shape[0], action_space.shape[0]
         widths = {
@@ -141,27 +64,54 @@ class OptionReplayBuffer(RingBuffer):
             "dones": 1,
             "discounts": 1,
         }
+        if context is not None:
+            widths |= {"local": context.local_dim, "here": context.dim}
         super().__init__(buffer_size, observation_space, action_space, widths, device, seed)
 
     def extend(self, steps: HighLevelSteps) -> None:
-        """Add the transitions of an episode."""
-        self._extend({name: getattr(steps, name) for name in self.data})
+        """Add the transitions of an episode; the time budget is left out where the level does not choose it."""
+        rows = {name: getattr(steps, name) for name in self.data}
+        self._extend({**rows, "actions": steps.actions[:, : self.action_dim]})
+
+    def sample_labelled(self, gradient_steps: int, batch_size: int) -> tuple[LevelBatch, th.Tensor]:
+        """As :meth:`sample_burst`, with the teacher's unit time budgets ``(gradient_steps, batch_size, 1)``.
+
+        :raises HierarchyError: without a teacher
+        """
+        if self.teacher is None:
+            raise HierarchyError("labelled samples need a teacher: set replay_buffer.teacher")
+        at = self.rng.integers(0, self.size(), gradient_steps * batch_size)
+        labels = self.teacher(*(self.data[name][at] for name in ("observations", "local", "here")))
+        parts = [*self._rows(at), np.asarray(labels, dtype=np.float32)]
+        shape = (gradient_steps, batch_size, -1)
+        *batch, labels_ = (th.from_numpy(part).view(shape).to(self.device) for part in parts)
+        return LevelBatch(*batch), labels_
 
     def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
         no_state = np.zeros((len(at), 0), dtype=np.float32)
-        return (*(array[at] for array in self.data.values()), no_state, no_state)
+        return (*(self.data[name][at] for name in LevelBatch._fields[:6]), no_state, no_state)
 
 
 class SubgoalReplayBuffer(RingBuffer):
-    """The low level's transitions with timed hindsight subgoals drawn when sampling (HiTS: ``future``).
+    """The low level's transitions, with hindsight subgoals drawn when sampling. Nothing is stored twice.
 
-    Of the samples, a share ``n / (n + 1)`` is relabelled: a step and a later-or-equal step of the same window are
-    drawn uniformly, the point reached at the later one becomes the subgoal, and the remaining time is what was left
-    until then (less a uniform fraction of a step, as time budgets are real-valued). Nothing is stored twice.
+    Of the samples, a share ``n / (n + 1)`` is relabelled. ``"timed"`` (HiTS): a step and a later-or-equal step of the
+    same window are drawn uniformly, the point reached at the later one becomes the subgoal, and the remaining time is
+    what was left until then (less a uniform fraction of a step, as time budgets are real-valued). ``"future"`` and
+    ``"episode"`` (HAC, which has no time): the point reached at a strictly later step of the window, or at any of
+    its steps; where fewer than n are there to draw from, the share falls accordingly.
 
     :param gamma: discount per environment step
     :param n_hindsight_goals: n above, relabelled samples per plain one
+    :param reward: the low level's reward, by default the sparse one
+    :param hindsight: ``"timed"``, ``"future"`` or ``"episode"``
+    :param sequence_length: with more than 1, memory states are not the stored ones but recomputed by :attr:`advance`
+        through up to ``sequence_length - 1`` preceding steps of the same window, under the sampled subgoal
+    :param reach_pairs: keep what :meth:`sample_pairs` needs
+    :raises ValueError: if ``hindsight`` is unknown or ``sequence_length`` not positive, or more than 1 without memory
     """
+
+    advance: Advance | None = None
 
     def __init__(
         self,
@@ -175,7 +125,20 @@ class SubgoalReplayBuffer(RingBuffer):
         n_hindsight_goals: float,
         device: th.device | str = "cpu",
         seed: int | None = None,
+        reward: LowLevelReward | None = None,
+        hindsight: str = "timed",
+        sequence_length: int = 1,
+        reach_pairs: bool = False,
     ) -> None:
+        if hindsight not in HINDSIGHT_SUBGOALS:
+            raise ValueError(f"hindsight must be one of {', '.join(HINDSIGHT_SUBGOALS)}, got {hindsight!r}")
+        if sequence_length < 1:
+            raise ValueError(f"sequence_length must be at least 1 (no burn-in), got {sequence_length}")
+        if sequence_length > 1 and not state_dim:
+            raise ValueError(
+                f"sequence_length={sequence_length} recomputes the low level's memory, but it has none: use "
+                "sequence_length=1, or a circuit (low.policy_kwargs.ndbc)"
+            )
         subgoals = layout.subgoals
         widths = {
             "local": subgoals.local_dim,
@@ -192,19 +155,63 @@ class SubgoalReplayBuffer(RingBuffer):
             "rewards": 1,
             "dones": 1,
         }
+        if reach_pairs:
+            widths["to_end"] = 1
         super().__init__(buffer_size, observation_space, action_space, widths, device, seed)
         self.layout, self.rules, self.gamma = layout, rules, gamma
-        self.relabelled_share = n_hindsight_goals / (n_hindsight_goals + 1.0)
+        self.reward = reward or LowLevelReward("sparse", subgoals, rules)
+        self.hindsight, self.n_hindsight_goals, self.sequence_length = hindsight, n_hindsight_goals, sequence_length
 
     def extend(self, steps: LowLevelSteps) -> None:
         """Add the transitions of an episode, in the order they happened."""
-        self._extend(steps._asdict())
+        rows = steps._asdict()
+        if "to_end" in self.data:
+            rows["to_end"] = np.arange(len(steps.rewards), 0, -1)
+        self._extend(rows)
+
+    def sample_pairs(self, n: int, horizon: int, rng: np.random.Generator) -> ReachPairs:
+        """Uniformly drawn steps, and a uniformly drawn one of the up to ``horizon`` points reached from there on.
+
+        :param rng: draws them, so that the sampling of transitions stays what it is without them
+        """
+        data = self.data
+        at = rng.integers(0, self.size(), n)
+        # how many rows were written after it, itself included: the ring's oldest rows follow its newest ones
+        written = self.buffer_size - (at - self.pos) % self.buffer_size if self.full else self.pos - at
+        ahead = np.minimum(data["to_end"][at, 0].astype(np.int64), written)
+        steps = rng.integers(0, np.minimum(ahead, horizon)) + 1
+        later = (at + steps - 1) % self.buffer_size
+        return ReachPairs(data["local"][at], data["here"][at], data["achieved"][later], steps.astype(np.float32))
 
     def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
         data = self.data
-        hindsight = self.rng.random(len(at)) < self.relabelled_share
-        where = np.flatnonzero(hindsight)
-        position, length = (data[name][at[where], 0].astype(np.int64) for name in ("position", "length"))
+        at, where, second = self._timed(at) if self.hindsight == "timed" else self._untimed(at)
+        subgoal, time_left = data["subgoal"][at], data["time_left"][at]
+        rewards, dones = data["rewards"][at], data["dones"][at]
+        subgoal[where] = data["achieved"][second]
+        expired = second == at[where]
+        if self.hindsight == "timed":
+            ahead = (second - at[where]) % self.buffer_size
+            time_left[where, 0] = ahead + 1 - self.rng.random(len(where), dtype=np.float32)
+        rewards[where, 0], dones[where, 0] = self._relabelled(at[where], subgoal[where], expired)
+        scale = np.float32(1.0 / self.rules.dt_max)
+        now, later = (np.clip(t * scale, 0.0, 1.0) for t in (time_left, time_left - 1.0))
+        observations = self.layout.low_from(data["local"][at], data["here"][at], subgoal, now)
+        return (
+            observations,
+            data["actions"][at],
+            self.layout.low_from(data["next_local"][at], data["achieved"][at], subgoal, later),
+            rewards,
+            dones,
+            np.full_like(rewards, self.gamma),
+            *self._states(at, subgoal, time_left, observations),
+        )
+
+    def _timed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Rows to sample, which of them are relabelled, and the rows whose outcome becomes their subgoal."""
+        share = self.n_hindsight_goals / (self.n_hindsight_goals + 1.0)
+        where = np.flatnonzero(self.rng.random(len(at)) < share)
+        position, length = (self.data[name][at[where], 0].astype(np.int64) for name in ("position", "length"))
         first, second = ordered_pairs(length, self.rng)
         begin = at[where] - position
         # rows of a window may have been overwritten by newer ones or lie across the ring's end: keep those as they are
@@ -212,28 +219,44 @@ class SubgoalReplayBuffer(RingBuffer):
         where, first, second, begin = where[whole], first[whole], second[whole], begin[whole]
         at = at.copy()
         at[where] = (begin + first) % self.buffer_size
-        subgoal, time_left = data["subgoal"][at], data["time_left"][at]
-        rewards, dones = data["rewards"][at], data["dones"][at]
-        subgoal[where] = data["achieved"][(begin + second) % self.buffer_size]
-        time_left[where, 0] = second - first + 1 - self.rng.random(len(where), dtype=np.float32)
-        expired = (second == first)[:, None]
-        if self.rules.window_end == "reached":
-            reached = self.layout.subgoals.reached(data["achieved"][at[where]], subgoal[where])[:, None]
-            rewards[where], dones[where] = reached, reached | expired
-        else:
-            rewards[where] = dones[where] = expired
-        scale = np.float32(1.0 / self.rules.dt_max)
-        now, later = (np.clip(t * scale, 0.0, 1.0) for t in (time_left, time_left - 1.0))
-        return (
-            self.layout.low_from(data["local"][at], data["here"][at], subgoal, now),
-            data["actions"][at],
-            self.layout.low_from(data["next_local"][at], data["achieved"][at], subgoal, later),
-            rewards,
-            dones,
-            np.full_like(rewards, self.gamma),
-            data["states"][at],
-            data["next_states"][at],
-        )
+        return at, where, (begin + second) % self.buffer_size
+
+    def _untimed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """The same for goals without time: the rows stay, only their subgoals are drawn."""
+        position, length = (self.data[name][at, 0].astype(np.int64) for name in ("position", "length"))
+        begin = at - position
+        start = position + 1 if self.hindsight == "future" else np.zeros_like(position)
+        copies = np.minimum(self.n_hindsight_goals, length - start)
+        chosen = (self.rng.random(len(at)) < copies / (copies + 1.0)) & self._intact(begin, length)
+        where = np.flatnonzero(chosen)
+        second = self.rng.integers(start[where], length[where])
+        return at, where, (begin[where] + second) % self.buffer_size
+
+    def _relabelled(
+        self, at: NDArray[np.int64], subgoal: Float32, expired: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+        """Rewards and ends of relabelled steps."""
+        if self.reward.kind == "sparse" and self.rules.window_end == "timed":
+            return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
+        return self.reward.of(self.data["here"][at], self.data["achieved"][at], subgoal, expired)
+
+    def _states(
+        self, at: NDArray[np.int64], subgoal: Float32, time_left: Float32, observations: Float32
+    ) -> tuple[Float32, Float32]:
+        """Memory states before and after the sampled steps: the stored ones, or recomputed by a burn-in."""
+        if self.sequence_length == 1 or self.advance is None:
+            return self.data["states"][at], self.data["next_states"][at]
+        position, length = (self.data[name][at, 0].astype(np.int64) for name in ("position", "length"))
+        back = np.minimum(position, self.sequence_length - 1)
+        back[~self._intact(at - position, length)] = 0
+        states = self.data["states"][(at - back) % self.buffer_size]
+        for steps in range(self.sequence_length - 1, 0, -1):
+            rows = np.flatnonzero(back >= steps)
+            earlier = (at[rows] - steps) % self.buffer_size
+            left = np.clip((time_left[rows] + steps) / np.float32(self.rules.dt_max), 0.0, 1.0)
+            seen = self.layout.low_from(self.data["local"][earlier], self.data["here"][earlier], subgoal[rows], left)
+            states[rows] = self.advance(seen, states[rows])
+        return states, self.advance(observations, states)
 
     def _intact(self, begin: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which windows still have all their rows: the one being overwritten at the write position has not."""

@@ -1,4 +1,4 @@
-"""Evaluation of two-level agents: success inside the time limit and the high level's action budget."""
+"""Evaluation: success inside the time limit and, with two levels, inside the high level's action budget."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_tbc.flat import FlatSAC
 from sb3_tbc.spaces import FloatArray
 from sb3_tbc.tbc_hrl.collection import forget
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
@@ -37,6 +38,49 @@ class EvaluationResult(NamedTuple):
         return float(self.lengths[self.successes].mean()) if self.successes.any() else None
 
 
+Agent = TBCHRL | FlatSAC
+"""What can be trained and evaluated here."""
+
+
+def evaluate_agent(
+    model: Agent,
+    env: VecEnv | gym.Env[Any, Any],
+    n_eval_episodes: int = 100,
+    seed: int | None = None,
+    deterministic: bool = True,
+) -> EvaluationResult:
+    """Evaluate an agent of any of our algorithms, see :func:`evaluate_hierarchical`."""
+    if isinstance(model, FlatSAC):
+        return evaluate_flat(model, env, n_eval_episodes, seed, deterministic)
+    return evaluate_hierarchical(model, env, n_eval_episodes, seed, deterministic)
+
+
+def evaluate_flat(
+    model: FlatSAC,
+    env: VecEnv | gym.Env[Any, Any],
+    n_eval_episodes: int = 100,
+    seed: int | None = None,
+    deterministic: bool = True,
+) -> EvaluationResult:
+    """As :func:`evaluate_hierarchical`, for an agent without subgoals: these figures are NaN, decisions are 0."""
+    venv = _vector(env, n_eval_episodes)
+    if seed is not None:
+        venv.seed(seed)
+    observation = venv.reset()
+    totals = np.zeros((2, venv.num_envs))  # steps, rewards
+    results: list[list[tuple[Any, ...]]] = [[] for _ in range(venv.num_envs)]
+    per_env = -(-n_eval_episodes // venv.num_envs)
+    while min(len(rows) for rows in results) < per_env:
+        actions, _ = model.predict(observation, deterministic=deterministic)  # type: ignore[arg-type]
+        observation, rewards, dones, infos = venv.step(actions)
+        totals += np.stack([np.ones(venv.num_envs), rewards])
+        for index in np.flatnonzero(dones):
+            success = bool(infos[index].get("is_success", False))
+            results[index].append((success, *totals[:, index], np.nan, np.nan, 0, False))
+            totals[:, index] = 0.0
+    return _columns([rows[i] for i in range(per_env) for rows in results], n_eval_episodes)
+
+
 def evaluate_hierarchical(
     model: TBCHRL,
     env: VecEnv | gym.Env[Any, Any],
@@ -56,14 +100,21 @@ def evaluate_hierarchical(
     :param deterministic: use the means of both levels (and the averaged actors)
     :raises ValueError: if ``n_eval_episodes`` is not positive
     """
-    if n_eval_episodes < 1:
-        raise ValueError(f"n_eval_episodes must be at least 1, got {n_eval_episodes}")
-    venv = env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
+    venv = _vector(env, n_eval_episodes)
     runner = _Runner(model, venv, deterministic, np.random.default_rng(seed))
     if seed is not None:
         venv.seed(seed)
     per_env = -(-n_eval_episodes // venv.num_envs)
-    rows = runner.run(per_env)
+    return _columns(runner.run(per_env), n_eval_episodes)
+
+
+def _vector(env: VecEnv | gym.Env[Any, Any], n_eval_episodes: int) -> VecEnv:
+    if n_eval_episodes < 1:
+        raise ValueError(f"n_eval_episodes must be at least 1, got {n_eval_episodes}")
+    return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
+
+
+def _columns(rows: list[tuple[Any, ...]], n_eval_episodes: int) -> EvaluationResult:
     columns = list(zip(*rows[:n_eval_episodes], strict=True))
     types = (bool, np.int64, np.float64, np.float64, np.float64, np.int64, bool)
     return EvaluationResult(*(np.array(column, dtype=t) for column, t in zip(columns, types, strict=True)))
@@ -74,7 +125,7 @@ class _Runner:
 
     def __init__(self, model: TBCHRL, venv: VecEnv, deterministic: bool, rng: np.random.Generator) -> None:
         self.model, self.deterministic, self.rng = model, deterministic, rng
-        self.env = HierarchicalVecEnv(venv, self._propose, model.layout, model.rules, 0)
+        self.env = HierarchicalVecEnv(venv, self._propose, model.layout, model.rules, schedule=model.schedule)
 
     def _propose(self, observations: FloatArray, where: NDArray[np.intp]) -> Proposal:
         no_state = np.zeros((len(where), 0), dtype=np.float32)

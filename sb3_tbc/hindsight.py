@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import Episode, OptionRules
 from sb3_tbc.spaces import FloatArray, SubgoalSpace
 
@@ -37,6 +38,7 @@ class HighLevelReward:
     :param dt_max: longest window, environment steps
     :param decision_cost: price of a decision (``"smdp"`` only: the HiTS reward has it built in)
     :param duration_cost: price of the longest time budget
+    :param completion_bonus: added where an option reached its subgoal, in hindsight too (paper section 4.5)
     :raises ValueError: if ``target`` is unknown
     """
 
@@ -46,6 +48,7 @@ class HighLevelReward:
     dt_max: float
     decision_cost: float
     duration_cost: float
+    completion_bonus: float = 0.0
 
     def __post_init__(self) -> None:
         if self.target not in ("smdp", "decision"):
@@ -95,11 +98,16 @@ class LowLevelSteps(NamedTuple):
     dones: NDArray[np.bool_]  # (T,) the window is over: no bootstrap
 
 
-def low_level_steps(episode: Episode, subgoals: SubgoalSpace, rules: OptionRules) -> LowLevelSteps:
-    """Ordinary transitions of the low level: reward 1 where the window ends with its subgoal reached.
+def low_level_steps(
+    episode: Episode, subgoals: SubgoalSpace, rules: OptionRules, reward: LowLevelReward | None = None
+) -> LowLevelSteps:
+    """Ordinary transitions of the low level.
 
     A window that the end of the episode cuts off is not over for the low level: its last step bootstraps.
+
+    :param reward: by default 1 where the window ends with its subgoal reached, else 0
     """
+    reward = reward or LowLevelReward("sparse", subgoals, rules)
     lengths = np.array([option.duration for option in episode.options])
     position = np.concatenate([np.arange(n) for n in lengths])
     per_step = np.repeat(np.arange(len(lengths)), lengths)
@@ -107,10 +115,9 @@ def low_level_steps(episode: Episode, subgoals: SubgoalSpace, rules: OptionRules
     subgoal = np.stack([option.subgoal for option in episode.options])[per_step]
     seen = _rows(episode, np.arange(episode.length + 1))
     local, points = subgoals.local(seen), subgoals.achieved(seen)
-    reached = subgoals.reached(points[1:], subgoal)
-    over = position + 1 >= budget
-    if rules.window_end == "reached":
-        over = over | (reached & (position + 1 >= rules.dt_min))
+    rewards, over = reward.of(
+        points[:-1], points[1:], subgoal, position + 1 >= budget, may_end=position + 1 >= rules.dt_min
+    )
     return LowLevelSteps(
         local=local[:-1],
         next_local=local[1:],
@@ -123,7 +130,7 @@ def low_level_steps(episode: Episode, subgoals: SubgoalSpace, rules: OptionRules
         time_left=budget - position,
         position=position,
         length=lengths[per_step],
-        rewards=(over & reached).astype(np.float64),
+        rewards=rewards,
         dones=over,
     )
 
@@ -148,6 +155,8 @@ class HighLevelSteps(NamedTuple):
     discounts: FloatArray
     relabelled: NDArray[np.bool_]  # whether the action is a hindsight one
     durations: NDArray[np.int64]
+    local: FloatArray  # what the low level saw when the option began
+    here: FloatArray  # and the subgoal-space point where it began
 
 
 class HindsightSettings(NamedTuple):
@@ -157,15 +166,24 @@ class HindsightSettings(NamedTuple):
     goal_strategy: str  # "future" or "episode"
     testing_penalty: float  # reward of a testing transition, negative
     keep_original: bool  # also store failed options as they were chosen (paper, algorithm 1 line 26)
+    tolerance: float | None = None  # relabelled options further than this from where they ended are not a success
 
 
 def relabel_actions(
-    episode: Episode, subgoals: SubgoalSpace, rules: OptionRules, rng: np.random.Generator
+    episode: Episode,
+    subgoals: SubgoalSpace,
+    rules: OptionRules,
+    rng: np.random.Generator,
+    tolerance: float | None = None,
 ) -> tuple[FloatArray, NDArray[np.bool_]]:
     """The action each option turned out to be, ``(n_options, subgoal_dim + 1)``, and which of them changed.
 
     An achieved option keeps its action; another becomes (point reached, time it took), with the time drawn so that
     the budget would have expired at just that step.
+
+    :param tolerance: the success test of hindsight (paper section 4.5): where the point that was reached, in unit
+        coordinates, lies further than this from the nearest subgoal there is (outside of the bounds), the hindsight
+        option would not have been a success either, and the option keeps its action; None takes the nearest subgoal
     """
     actions = np.stack([option.unit_action for option in episode.options])
     failed = np.array([not option.reached for option in episode.options])
@@ -174,9 +192,23 @@ def relabel_actions(
         durations = np.array([option.duration for option in episode.options])[failed]
         reached = subgoals.achieved(_rows(episode, ends))
         took = durations - rng.random(len(durations))
-        actions[failed, :-1] = np.clip(subgoals.scale(reached), -1.0, 1.0)
+        unit = subgoals.scale(reached)
+        if tolerance is not None:
+            success = hindsight_success(unit, np.clip(unit, -1.0, 1.0), tolerance)
+            failed[failed] = success
+            unit, took = unit[success], took[success]
+        actions[failed, :-1] = np.clip(unit, -1.0, 1.0)
         actions[failed, -1] = rules.unit_budget(np.maximum(took, rules.dt_min))
     return actions, failed
+
+
+def hindsight_success(reached: FloatArray, subgoal: FloatArray, tolerance: float = 0.05) -> NDArray[np.bool_]:
+    """Whether relabelled options succeed: ``||phi(s') - phi(g_hat)||_2 <= tolerance`` (paper section 4.5), ``(n,)``.
+
+    :param reached: where the options ended, unit coordinates ``(n, subgoal_dim)``
+    :param subgoal: their hindsight subgoals, unit coordinates
+    """
+    return np.asarray(np.linalg.norm(reached - subgoal, axis=-1) <= tolerance)
 
 
 def _rows(episode: Episode, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
@@ -228,10 +260,13 @@ def high_level_steps(
     durations = np.array([option.duration for option in episode.options])
     ends = starts + durations
     chosen = np.stack([option.unit_action for option in episode.options])
-    actions, failed = relabel_actions(episode, subgoals, rules, rng)
+    reached = np.array([option.reached for option in episode.options])
+    actions, changed = relabel_actions(episode, subgoals, rules, rng, settings.tolerance)
     testing = np.array([option.testing for option in episode.options])
     before, after = _rows(episode, starts), _rows(episode, ends)
+    local, here = subgoals.local(before), subgoals.achieved(before)
     rewards = reward.of(episode.rewards, starts, durations)
+    bonus = reward.completion_bonus * (reached | changed)
     dones = np.zeros(n, dtype=bool)
     dones[-1] = episode.terminated
 
@@ -249,33 +284,31 @@ def high_level_steps(
             old["desired_goal"] = new["desired_goal"] = goals
         return HighLevelSteps(
             high_view(old), actions, rewards, high_view(new), dones, reward.discounts(durations),
-            failed[rows] & relabelled, durations,
+            changed[rows] & relabelled, durations, local[rows], here[rows],
         )  # fmt: skip
 
     def charged(rewards: FloatArray, actions: FloatArray) -> FloatArray:
         return rewards - reward.duration_cost * rules.budget(actions[:, -1]) / rules.dt_max
 
     parts = []
-    tests = np.flatnonzero(testing & failed)
+    tests = np.flatnonzero(testing & ~reached)
     penalty = np.full(len(tests), settings.testing_penalty)
     parts.append(steps(tests, chosen[tests], penalty, dones[tests], durations[tests], False))
     if settings.keep_original:
-        kept = np.flatnonzero(failed & ~testing)
+        kept = np.flatnonzero(changed & ~testing)
         parts.append(
             steps(kept, chosen[kept], charged(rewards[kept], chosen[kept]), dones[kept], durations[kept], False)
         )
-    every = np.arange(n)
-    parts.append(steps(every, actions, charged(rewards, actions), dones, durations, True))
+    every = np.flatnonzero(reached | changed | ~testing)  # a failed test without a hindsight action has its penalty
+    gained = charged(rewards, actions) + bonus
+    parts.append(steps(every, actions[every], gained[every], dones[every], durations[every], True))
     pairs = goal_pairs(n, settings.n_goals, settings.goal_strategy, rng)
     if len(pairs):
         goals = episode.achieved_goal[ends[pairs[:, 1]]]
         copies = relabel_goals(episode, starts[pairs[:, 0]], durations[pairs[:, 0]], goals, reward, goal_test)
         rows = pairs[:, 0]
-        parts.append(
-            steps(
-                rows, actions[rows], charged(copies.rewards, actions[rows]), copies.dones, copies.durations, True, goals
-            )
-        )
+        again = charged(copies.rewards, actions[rows]) + bonus[rows]
+        parts.append(steps(rows, actions[rows], again, copies.dones, copies.durations, True, goals))
     return HighLevelSteps(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 

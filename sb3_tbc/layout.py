@@ -36,11 +36,13 @@ def width(space: spaces.Dict, key: str) -> int:
 
 
 class LevelLayout(NamedTuple):
-    """How the flat observation vectors of both levels are put together."""
+    """How the flat observation and action vectors of both levels are put together."""
 
     subgoals: SubgoalSpace
     achieved_in_observation: bool = True
     relative_subgoals: bool = False
+    remaining_time: bool = True  # whether the low level sees how much of its time budget is left
+    timed_actions: bool = True  # whether the high level's action ends with a time budget
 
     def high(self, observation: GoalObservation) -> FloatArray:
         """What the high level sees: desired goal, observation and, where the task needs it, achieved goal."""
@@ -59,7 +61,8 @@ class LevelLayout(NamedTuple):
     ) -> FloatArray:
         """The same from its parts: ``here`` is the subgoal-space point of the state, ``remaining`` has a last axis."""
         asked = subgoal - here if self.relative_subgoals and here is not None else subgoal
-        return np.concatenate([local, asked, remaining], axis=-1).astype(np.float32)
+        parts = [local, asked, remaining] if self.remaining_time else [local, asked]
+        return np.concatenate(parts, axis=-1).astype(np.float32)
 
     def high_space(self, space: spaces.Dict) -> spaces.Box:
         """Observation space of the high level."""
@@ -69,8 +72,14 @@ class LevelLayout(NamedTuple):
 
     def low_space(self) -> spaces.Box:
         """Observation space of the low level."""
-        return spaces.Box(-np.inf, np.inf, (self.subgoals.local_dim + self.subgoals.dim + 1,), np.float32)
+        size = self.subgoals.local_dim + self.subgoals.dim + int(self.remaining_time)
+        return spaces.Box(-np.inf, np.inf, (size,), np.float32)
 
     def high_action_space(self) -> spaces.Box:
-        """Action space of the high level in unit coordinates: subgoal, then time budget."""
-        return spaces.Box(-1.0, 1.0, (self.subgoals.dim + 1,), np.float32)
+        """Action space of the high level in unit coordinates: subgoal, then time budget where it chooses one."""
+        return spaces.Box(-1.0, 1.0, (self.subgoals.dim + int(self.timed_actions),), np.float32)
+
+    def low_scale(self) -> FloatArray:
+        """Fixed scales that bring the low level's observation to about [-1, 1]."""
+        time = [1.0] if self.remaining_time else []
+        return np.concatenate([self.subgoals.local_scale, self.subgoals.resolution_scale, time])

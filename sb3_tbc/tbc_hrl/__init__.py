@@ -1,6 +1,7 @@
-"""TBC-HRL and HiTS: two SAC levels joined by timed windows."""
+"""TBC-HRL, HiTS and HAC: two SAC levels joined by windows."""
 
-from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL, HiTS
+from sb3_tbc.tbc_hrl.baselines import HAC, HiTS
+from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
 
-__all__ = ["TBCHRL", "HiTS", "TBCPolicy"]
+__all__ = ["HAC", "TBCHRL", "HiTS", "TBCPolicy"]

@@ -125,10 +125,7 @@ class FrozenActor:
         :param deterministic: the squashed mean instead of a sample
         :param rng: source of the noise
         """
-        if self._version != self._policy.weights_version:
-            self._net.refresh()
-            self._version = self._policy.weights_version
-        outputs, next_states = self._net(observations, states)
+        outputs, next_states = self._current()(observations, states)
         dim, bound = self._dim, self._mean_bound
         mean = outputs[:, :dim]
         if bound is not None:
@@ -139,3 +136,13 @@ class FrozenActor:
             std += mean
             mean = std
         return np.tanh(mean), next_states
+
+    def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
+        """States ``(n, state_dim)`` after a step with these observations."""
+        return self._current()(observations, states)[1]
+
+    def _current(self) -> FrozenNet:
+        if self._version != self._policy.weights_version:
+            self._net.refresh()
+            self._version = self._policy.weights_version
+        return self._net

@@ -18,11 +18,12 @@ from sb3_tbc.hindsight import (
     low_level_steps,
 )
 from sb3_tbc.layout import LevelLayout
+from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import Episode, OptionRules
 from sb3_tbc.spaces import FloatArray
 from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.tbc_hrl.replay import Replay
-from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal
+from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal, Schedule
 
 
 class Exploration(NamedTuple):
@@ -59,6 +60,7 @@ class Collector:
     :param exploration: see :class:`Exploration`
     :param rng: source of all randomness here
     :param unscale: from the low level's unit actions to the environments'
+    :param schedule: gives the time budgets where the high level does not
     """
 
     def __init__(
@@ -71,10 +73,11 @@ class Collector:
         exploration: Exploration,
         rng: np.random.Generator,
         unscale: Callable[[FloatArray], FloatArray],
+        schedule: Schedule | None = None,
     ) -> None:
         self.high, self.low, self.rng, self.unscale = high, low, rng, unscale
         self.exploration = exploration
-        self.env = HierarchicalVecEnv(venv, self.propose, layout, rules, low.state_dim)
+        self.env = HierarchicalVecEnv(venv, self.propose, layout, rules, low.state_dim, schedule)
         self.membrane = np.zeros((venv.num_envs, low.state_dim), dtype=np.float32)
         self.observation: FloatArray = self.env.reset()
 
@@ -121,6 +124,7 @@ class EpisodeStore:
 
     :param replay: where they go
     :param reward: the high level's reward and discount
+    :param low_reward: the low level's reward
     :param hindsight: how much of it
     :param rng: draws hindsight goals and times
     """
@@ -131,16 +135,17 @@ class EpisodeStore:
         layout: LevelLayout,
         rules: OptionRules,
         reward: HighLevelReward,
+        low_reward: LowLevelReward,
         hindsight: HindsightSettings,
         rng: np.random.Generator,
     ) -> None:
         self.replay, self.layout, self.rules = replay, layout, rules
-        self.reward, self.hindsight, self.rng = reward, hindsight, rng
+        self.reward, self.low_reward, self.hindsight, self.rng = reward, low_reward, hindsight, rng
 
     def add(self, episode: Episode, goal_test: GoalTest) -> HighLevelSteps:
         """Store an episode; what the high level learns from it."""
         subgoals = self.layout.subgoals
-        self.replay.low.extend(low_level_steps(episode, subgoals, self.rules))
+        self.replay.low.extend(low_level_steps(episode, subgoals, self.rules, self.low_reward))
         steps = high_level_steps(
             episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.layout.high, self.rng
         )

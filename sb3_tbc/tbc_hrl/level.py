@@ -92,6 +92,8 @@ class SACLevel(SAC):
     :param ent_coef_learning_rate: of the automatic temperature, by default the schedule ``learning_rate``
     :param compile: "auto" (compiled if there is a C++ compiler), True or False (eager)
     :param name: names the level in messages and logs (``low/critic_loss``)
+    :param label_coef: weight of a regression of the last action coordinate toward labels of the replay buffer in the
+        actor's loss (the paper's duration loss); if positive, batches come from ``replay_buffer.sample_labelled``
 
     Other parameters are SB3's; ``policy_kwargs`` are :class:`LevelPolicy`'s.
     """
@@ -115,6 +117,7 @@ class SACLevel(SAC):
         compile: bool | str = "auto",
         ent_coef_learning_rate: float | None = None,
         name: str = "level",
+        label_coef: float = 0.0,
     ) -> None:
         super().__init__(
             LevelPolicy if isinstance(policy, str) else policy,
@@ -133,6 +136,7 @@ class SACLevel(SAC):
         self.compile = compile
         self.ent_coef_learning_rate = ent_coef_learning_rate
         self.log_prefix = f"{name}/"
+        self.label_coef = label_coef
         self.set_logger(Logger(folder=None, output_formats=[]))
         self._setup_model()
         self.replay_buffer = replay_buffer  # type: ignore[assignment]
@@ -143,7 +147,7 @@ class SACLevel(SAC):
             zeros = {"exp_avg": th.zeros(1), "exp_avg_sq": th.zeros(1)}
             self.ent_coef_optimizer.state[self.log_ent_coef] = {"step": th.tensor(0.0), **zeros}
         self.noise_rng = np.random.default_rng(self.seed)
-        self._update = SACUpdate(self.policy, self.ent_coef_optimizer, self.compile)
+        self._update = SACUpdate(self.policy, self.ent_coef_optimizer, self.compile, self.label_coef)
         self._frozen = {average: FrozenActor(self.policy, average) for average in (False, True)}
 
     def _excluded_save_params(self) -> list[str]:
@@ -186,11 +190,21 @@ class SACLevel(SAC):
         self.logger.record(self.log_prefix + "n_updates", self._n_updates, exclude="tensorboard")
 
     def _run(self, gradient_steps: int, batch_size: int) -> dict[str, float]:
-        batch: LevelBatch = self.replay_buffer.sample_burst(gradient_steps, batch_size)  # type: ignore[union-attr]
+        buffer: Any = self.replay_buffer
+        labels: th.Tensor | None = None
+        if self.label_coef:
+            batch, labels = buffer.sample_labelled(gradient_steps, batch_size)
+        else:
+            batch = buffer.sample_burst(gradient_steps, batch_size)
         shape = (gradient_steps, 2, batch.rewards.shape[1], self._update.action_dim)
         noise = th.from_numpy(self.noise_rng.standard_normal(shape, dtype=np.float32))
         return self._update.run(
-            batch, noise, tau=self.tau, target_entropy=float(self.target_entropy), ent_coef=self._ent_coef_state()
+            batch,
+            noise,
+            tau=self.tau,
+            target_entropy=float(self.target_entropy),
+            ent_coef=self._ent_coef_state(),
+            labels=labels,
         )
 
     def _ent_coef_state(self) -> th.Tensor:
@@ -258,3 +272,7 @@ class SACLevel(SAC):
         :return: unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``
         """
         return self._frozen[average].act(observations, states, deterministic, rng)
+
+    def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
+        """Memory states ``(n, state_dim)`` after a step with these observations, from the current weights."""
+        return self._frozen[False].advance(observations, states)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import io
-import os
 import pathlib
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
+from sb3_tbc.ring_buffer import write_arrays
 
 
 class Replay(NamedTuple):
@@ -20,19 +20,8 @@ class Replay(NamedTuple):
 
     def save(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write both buffers to one file of plain arrays, atomically."""
-        arrays: dict[str, Any] = {
-            f"{name}.{key}": array
-            for name, buffer in self._asdict().items()
-            for key, array in buffer.get_state().items()
-        }
-        if not isinstance(path, (str, pathlib.Path)):
-            np.savez(path, **arrays)
-            return
-        target = pathlib.Path(path)
-        partial = target.with_name(target.name + ".partial")
-        with open(partial, "wb") as file:
-            np.savez(file, **arrays)
-        os.replace(partial, target)
+        states = {name: buffer.get_state() for name, buffer in self._asdict().items()}
+        write_arrays(path, {f"{name}.{key}": x for name, state in states.items() for key, x in state.items()})
 
     def load(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Read what :meth:`save` wrote; only plain arrays are read, never pickled objects.

@@ -22,6 +22,8 @@ LEVEL_DEFAULTS: dict[str, Any] = {
 }
 """What a level uses where the user says nothing; the head's bounds are HiTS's (sigma in [1e-3, 6])."""
 
+CHOICES = {"memory": ("window", "episode", "none"), "duration": ("joint", "rule", "fixed")}
+
 DEFAULT_WIRING = {
     "inter": 8,
     "command": 6,
@@ -70,3 +72,30 @@ def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str,
     if name == "high":
         kwargs.setdefault("negative_critic", True)
     return {**LEVEL_DEFAULTS, **given, "policy_kwargs": kwargs}
+
+
+def check_settings(given: Mapping[str, Any]) -> None:
+    """Refuse an agent's settings that cannot be meant.
+
+    :param given: the settings by name
+    :raises ValueError: naming the value, what is allowed and the likely cure
+    """
+    for name, allowed in CHOICES.items():
+        if given[name] not in allowed:
+            raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {given[name]!r}")
+    for name in ("testing_fraction", "random_fraction"):
+        if not 0.0 <= given[name] <= 1.0:
+            raise ValueError(f"{name} must lie in [0, 1], got {given[name]}")
+    for name in ("gradient_ratio", "duration_loss_coef"):
+        if given[name] < 0:
+            raise ValueError(f"{name} must not be negative, got {given[name]}")
+    if given["sequence_length"] > 1 and given["memory"] == "none":
+        raise ValueError(
+            f"sequence_length={given['sequence_length']} recomputes the low level's memory, but memory='none' keeps "
+            "none: use memory='window' or sequence_length=1"
+        )
+    if given["duration_loss_coef"] and given["duration"] != "joint":
+        raise ValueError(
+            f"duration_loss_coef={given['duration_loss_coef']} teaches a high level that chooses its time budgets: "
+            f"use duration='joint' (here {given['duration']!r}), or 0"
+        )

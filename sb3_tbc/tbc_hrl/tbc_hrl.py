@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import pathlib
 import time
 from collections.abc import Mapping
@@ -21,14 +22,17 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.hindsight import HighLevelReward, HindsightSettings
 from sb3_tbc.layout import LevelLayout, check_goal_space
+from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import OptionRules
 from sb3_tbc.spaces import SubgoalSpace
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, Exploration, goal_test_of
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.tbc_hrl.policies import LevelPolicy
+from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY, Reachability
 from sb3_tbc.tbc_hrl.replay import Replay
-from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, attribute_of, learning_rate_of, level_settings
+from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
+from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, attribute_of, check_settings, learning_rate_of, level_settings
 from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
 
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
@@ -46,24 +50,36 @@ class TBCHRL(BaseAlgorithm):
     :param high: settings of the high level under SB3's names (``learning_rate, batch_size, gamma, tau, ent_coef,
         target_entropy, ent_coef_learning_rate, buffer_size, policy_kwargs``); ``gamma`` is per decision
     :param low: settings of the low level, likewise; ``policy_kwargs["ndbc"]`` holds the circuit's wiring, None for an
-        MLP actor; ``n_hindsight_goals`` may differ from the high level's
+        MLP actor; ``n_hindsight_goals`` and ``goal_strategy`` may differ from the high level's
     :param max_options: high-level decisions allowed per episode
     :param window_end: ``"timed"`` or ``"reached"``, see :class:`~sb3_tbc.options.OptionRules`
     :param dt_min: shortest time budget, environment steps
     :param dt_max: longest, or -1 for the episode's length divided by ``max_options``
+    :param duration: who sets the time budget: ``"joint"`` (the high level, with the subgoal), ``"rule"`` (equation 1:
+        ``clip(kappa * H_reach, dt_min, dt_max)``) or ``"fixed"`` (always ``fixed_duration``)
+    :param fixed_duration: constant window, environment steps; None for ``dt_max``
+    :param kappa: scales the estimated steps to a subgoal into a time budget (table A2)
+    :param duration_loss_coef: weight of the loss that draws the high level's time budget toward the rule's, in unit
+        action coordinates; 0 leaves it out
+    :param remaining_time: whether the low level sees how much of its time budget is left
     :param target: ``"smdp"`` (paper) or ``"decision"`` (HiTS), see :class:`~sb3_tbc.hindsight.HighLevelReward`
     :param decision_cost: price of one decision
     :param duration_cost: price of the longest time budget
+    :param completion_bonus: added to the reward of options that reach their subgoal, in hindsight too
+    :param low_reward: ``"sparse"``, ``"dense"`` or ``"step"``, see :class:`~sb3_tbc.low_reward.LowLevelReward`
     :param testing_fraction: share of options that test their subgoal
     :param deterministic_testing: whether the low level acts deterministically in a test (the public HiTS does not)
     :param testing_penalty: reward of a failed test, None for ``-max_options``
     :param keep_original: also learn from failed options as they were chosen (paper, algorithm 1)
+    :param relabel_tolerance: largest distance, in unit coordinates, between where a failed option ended and the subgoal
+        it is relabelled with (the paper's success test: 0.05); None relabels them all
     :param random_fraction: share of uniformly random actions on each level while exploring
     :param n_hindsight_goals: hindsight goals per transition
     :param goal_strategy: where the high level's hindsight goals come from, ``"future"`` or ``"episode"``
     :param gradient_ratio: updates of each level per environment step, done in bursts after episodes
     :param learning_starts: environment steps before the first update
     :param memory: when the membrane is reset: ``"window"``, ``"episode"`` or ``"none"`` (every step)
+    :param sequence_length: steps through which the low level's update recomputes its memory; 1 uses the stored one
     :param relative_subgoals: show the low level the distance to its subgoal instead of the subgoal itself
     :param subgoals: the subgoal space, for environments that do not bring one
     :param compile: compile the updates: ``"auto"`` (where a C++ compiler is found and it pays), True or False
@@ -75,6 +91,9 @@ class TBCHRL(BaseAlgorithm):
     default_window_end: ClassVar[str] = "timed"
     default_target: ClassVar[str] = "smdp"
     default_circuit: ClassVar[bool] = True
+    default_duration: ClassVar[str] = "joint"
+    default_low_reward: ClassVar[str] = "sparse"
+    default_remaining_time: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -87,19 +106,28 @@ class TBCHRL(BaseAlgorithm):
         window_end: str | None = None,
         dt_min: float = 0.0,
         dt_max: float = -1.0,
+        duration: str | None = None,
+        fixed_duration: float | None = None,
+        kappa: float = 1.0,
+        duration_loss_coef: float = 0.0,
+        remaining_time: bool | None = None,
         target: str | None = None,
         decision_cost: float = 1.0,
         duration_cost: float = 1.0,
+        completion_bonus: float = 0.0,
+        low_reward: str | None = None,
         testing_fraction: float = 0.3,
         deterministic_testing: bool = False,
         testing_penalty: float | None = None,
         keep_original: bool = False,
+        relabel_tolerance: float | None = None,
         random_fraction: float = 0.05,
         n_hindsight_goals: float = 3,
         goal_strategy: str = "future",
         gradient_ratio: float = 1.0,
         learning_starts: int = 0,
         memory: str = "window",
+        sequence_length: int = 1,
         relative_subgoals: bool = False,
         subgoals: SubgoalSpace | None = None,
         compile: bool | str = "auto",
@@ -122,17 +150,23 @@ class TBCHRL(BaseAlgorithm):
             seed=seed,
         )
         self.high_settings = level_settings("high", high)
-        self.low_settings = level_settings("low", low, extra=("n_hindsight_goals",))
+        self.low_settings = level_settings("low", low, extra=("n_hindsight_goals", "goal_strategy"))
         self.max_options, self.dt_min, self.dt_max = max_options, dt_min, dt_max
         self.window_end = window_end or self.default_window_end
+        self.duration, self.fixed_duration = duration or self.default_duration, fixed_duration
+        self.kappa, self.duration_loss_coef = kappa, duration_loss_coef
+        self.remaining_time = self.default_remaining_time if remaining_time is None else remaining_time
         self.target = target or self.default_target
+        self.low_reward = low_reward or self.default_low_reward
         self.decision_cost, self.duration_cost = decision_cost, duration_cost
+        self.completion_bonus = completion_bonus
         self.testing_fraction, self.deterministic_testing = testing_fraction, deterministic_testing
         self.testing_penalty, self.keep_original = testing_penalty, keep_original
+        self.relabel_tolerance = relabel_tolerance
         self.random_fraction, self.n_hindsight_goals = random_fraction, n_hindsight_goals
         self.goal_strategy = goal_strategy
         self.gradient_ratio, self.learning_starts = gradient_ratio, learning_starts
-        self.memory, self.compile = memory, compile
+        self.memory, self.sequence_length, self.compile = memory, sequence_length, compile
         self.subgoals, self.relative_subgoals = subgoals, relative_subgoals
         self._n_updates = 0
         self._updated_at = 0
@@ -143,7 +177,7 @@ class TBCHRL(BaseAlgorithm):
 
     def _setup_model(self) -> None:
         """Build both levels from the environment's spaces, or after loading from the saved ones."""
-        self._check_settings()
+        check_settings(vars(self))
         self.set_random_seed(self.seed)
         space, actions = check_goal_space(self.observation_space), self.action_space
         if not isinstance(actions, spaces.Box) or len(actions.shape) != 1:
@@ -152,48 +186,81 @@ class TBCHRL(BaseAlgorithm):
             self._read_environment(self.env)
         if self.subgoals is None:
             raise ValueError("no subgoal space: pass subgoals=SubgoalSpace(...), or an environment that has .subgoals")
-        self.rules = OptionRules(self.dt_max, self.dt_min, self.max_options, self.window_end)
-        self.layout = LevelLayout(self.subgoals, self.achieved_in_observation, self.relative_subgoals)
-        self.high_reward = HighLevelReward(
-            self.target, self.high_settings["gamma"], self.rules.dt_ref, self.rules.dt_max,
-            self.decision_cost, self.duration_cost,
-        )  # fmt: skip
-        seeds = np.random.SeedSequence(self.seed).generate_state(6).tolist()
+        self._set_rules(self.subgoals)
+        seeds = np.random.SeedSequence(self.seed).generate_state(7).tolist()
         self.rng = np.random.default_rng(seeds[0])
         high_spaces = self.layout.high_space(space), self.layout.high_action_space()
         low_spaces = self.layout.low_space(), spaces.Box(-1.0, 1.0, actions.shape, np.float32)
         self.high = self._make_level("high", self.high_settings, *high_spaces, seed=seeds[1])
         self.low = self._make_level("low", self.low_settings, *low_spaces, seed=seeds[2])
-        high_buffer = OptionReplayBuffer(
-            self.high_settings["buffer_size"], *high_spaces, device=self.device, seed=seeds[3]
+        self._set_schedule(self.subgoals, seeds[6])
+        self.replay_buffer = Replay(
+            self._make_high_buffer(*high_spaces, seeds[3]), self._make_low_buffer(*low_spaces, seeds[4])
         )
-        low_buffer = SubgoalReplayBuffer(
-            self.low_settings["buffer_size"], *low_spaces, layout=self.layout, rules=self.rules,
-            state_dim=self.low.state_dim, gamma=self.low_settings["gamma"],
-            n_hindsight_goals=self.low_settings.get("n_hindsight_goals", self.n_hindsight_goals),
-            device=self.device, seed=seeds[4],
-        )  # fmt: skip
-        self.replay_buffer = Replay(high_buffer, low_buffer)
-        self.high.attach(high_buffer)
-        self.low.attach(low_buffer)
-        self.policy = TBCPolicy(space, actions, self.high, self.low, self.layout, self.rules, self.memory, seeds[5])
+        self.high.attach(self.replay_buffer.high)
+        self.low.attach(self.replay_buffer.low)
+        self.policy = TBCPolicy(
+            space, actions, self.high, self.low, self.layout, self.rules, self.memory, seeds[5], self.schedule
+        )
         self.store = EpisodeStore(
-            self.replay_buffer, self.layout, self.rules, self.high_reward, self._hindsight_settings(), self.rng
-        )
+            self.replay_buffer, self.layout, self.rules, self.high_reward, self.low_level_reward,
+            self._hindsight_settings(), self.rng,
+        )  # fmt: skip
         self.diagnostics = EpisodeDiagnostics()
+
+    def _set_rules(self, subgoals: SubgoalSpace) -> None:
+        """What ends a window, what each level sees, what each is rewarded for."""
+        self.rules = OptionRules(self.dt_max, self.dt_min, self.max_options, self.window_end)
+        chooses_time = self.duration == "joint"
+        self.layout = LevelLayout(
+            subgoals, self.achieved_in_observation, self.relative_subgoals, self.remaining_time, chooses_time
+        )
+        self.high_reward = HighLevelReward(
+            self.target, self.high_settings["gamma"], self.rules.dt_ref, self.rules.dt_max, self.decision_cost,
+            0.0 if self.duration == "fixed" else self.duration_cost, self.completion_bonus,
+        )  # fmt: skip
+        self.low_level_reward = LowLevelReward(self.low_reward, subgoals, self.rules)
+
+    def _set_schedule(self, subgoals: SubgoalSpace, seed: int) -> None:
+        """Who sets time budgets (paper, section 4.1), and the reachability estimate where it is needed."""
+        self.reachability: Reachability | None = None
+        self.schedule: FixedWindows | ReachRule | None = None
+        if self.duration == "fixed":
+            steps = self.rules.dt_max if self.fixed_duration is None else self.fixed_duration
+            self.schedule = FixedWindows(self.rules, steps)
+        elif self.duration == "rule" or self.duration_loss_coef:
+            horizon = math.ceil(2.0 * self.rules.dt_max)
+            self.reachability = Reachability(subgoals, self.rules.dt_ref, horizon, seed=seed)
+            self.rule = ReachRule(self.layout, self.rules, self.reachability, self.kappa)
+            self.schedule = self.rule if self.duration == "rule" else None
+
+    def _make_high_buffer(self, observation: spaces.Box, action: spaces.Box, seed: int) -> OptionReplayBuffer:
+        taught = self.subgoals if self.duration_loss_coef else None
+        buffer = OptionReplayBuffer(
+            self.high_settings["buffer_size"], observation, action, device=self.device, seed=seed, context=taught
+        )
+        if self.duration_loss_coef:
+            buffer.teacher = DurationTeacher(self.rule, self.high)
+        return buffer
+
+    def _make_low_buffer(self, observation: spaces.Box, action: spaces.Box, seed: int) -> SubgoalReplayBuffer:
+        settings, untimed = self.low_settings, self.low_reward == "step"
+        buffer = SubgoalReplayBuffer(
+            settings["buffer_size"], observation, action, layout=self.layout, rules=self.rules,
+            state_dim=self.low.state_dim, gamma=settings["gamma"],
+            n_hindsight_goals=settings.get("n_hindsight_goals", self.n_hindsight_goals),
+            device=self.device, seed=seed, reward=self.low_level_reward,
+            hindsight=settings.get("goal_strategy", self.goal_strategy) if untimed else "timed",
+            sequence_length=self.sequence_length, reach_pairs=self.reachability is not None,
+        )  # fmt: skip
+        buffer.advance = self.low.advance
+        return buffer
 
     def _hindsight_settings(self) -> HindsightSettings:
         penalty = -float(self.max_options) if self.testing_penalty is None else self.testing_penalty
-        return HindsightSettings(int(self.n_hindsight_goals), self.goal_strategy, penalty, self.keep_original)
-
-    def _check_settings(self) -> None:
-        if self.memory not in ("window", "episode", "none"):
-            raise ValueError(f"memory must be 'window', 'episode' or 'none', got {self.memory!r}")
-        for name in ("testing_fraction", "random_fraction"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} must lie in [0, 1], got {getattr(self, name)}")
-        if self.gradient_ratio < 0:
-            raise ValueError(f"gradient_ratio must not be negative, got {self.gradient_ratio}")
+        return HindsightSettings(
+            int(self.n_hindsight_goals), self.goal_strategy, penalty, self.keep_original, self.relabel_tolerance
+        )
 
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""
@@ -218,24 +285,19 @@ class TBCHRL(BaseAlgorithm):
     ) -> SACLevel:
         policy_kwargs = dict(settings["policy_kwargs"])
         if name == "low":
-            policy_kwargs["ndbc"] = self._circuit(policy_kwargs, action.shape[0])
+            default = {**DEFAULT_WIRING, "motor": action.shape[0]} if self.default_circuit else None
+            circuit = policy_kwargs.get("ndbc", default)
+            scale = {"input_scale": self.layout.low_scale().tolist()}
+            policy_kwargs["ndbc"] = None if circuit is None else {**scale, **circuit}
+            policy_kwargs.setdefault("negative_critic", self.low_reward == "step")
         gamma = settings["gamma"]
         level = SACLevel(
             LevelPolicy, observation, action, None, learning_rate_of(settings["learning_rate"]), gamma, settings["tau"],
             settings["ent_coef"], settings["target_entropy"], policy_kwargs, seed=seed, device=self.device,
             compile=self.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"], name=name,
+            label_coef=self.duration_loss_coef if name == "high" else 0.0,
         )  # fmt: skip
         return level
-
-    def _circuit(self, policy_kwargs: dict[str, Any], action_dim: int) -> dict[str, Any] | None:
-        """The NDBC settings with the task's fixed input scales; None for an MLP actor."""
-        default = {**DEFAULT_WIRING, "motor": action_dim} if self.default_circuit else None
-        circuit = policy_kwargs.get("ndbc", default)
-        if circuit is None:
-            return None
-        subgoals = self.layout.subgoals
-        scale = np.concatenate([subgoals.local_scale, subgoals.resolution_scale, [1.0]])
-        return {"input_scale": scale.tolist(), **circuit}
 
     # ------------------------------------------------------------------ learning
 
@@ -260,7 +322,15 @@ class TBCHRL(BaseAlgorithm):
         for level in (self.high, self.low):
             level.set_logger(self.logger)
         collector = Collector(
-            self.env, self.high, self.low, self.layout, self.rules, self._exploration(), self.rng, self.policy._unscale
+            self.env,
+            self.high,
+            self.low,
+            self.layout,
+            self.rules,
+            self._exploration(),
+            self.rng,
+            self.policy._unscale,
+            self.schedule,
         )
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
@@ -316,6 +386,9 @@ class TBCHRL(BaseAlgorithm):
                 level._current_progress_remaining = self._current_progress_remaining
                 level.train(updates, settings["batch_size"])
         self._n_updates += updates
+        if self.reachability is not None:
+            loss = self.reachability.train_on(self.replay_buffer.low, max(steps // UPDATE_EVERY, 1))
+            self.logger.record("reachability/loss", loss)
 
     def dump_logs(self) -> None:
         """Write what was seen since the last time: SB3's keys, and per level what explains learning."""
@@ -339,7 +412,8 @@ class TBCHRL(BaseAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [
             *super()._excluded_save_params(),
-            "high", "low", "rng", "layout", "rules", "high_reward", "store", "diagnostics", "replay_buffer",
+            "high", "low", "rng", "layout", "rules", "high_reward", "low_level_reward", "store", "diagnostics",
+            "replay_buffer", "schedule", "rule", "reachability",
         ]  # fmt: skip
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -348,6 +422,8 @@ class TBCHRL(BaseAlgorithm):
             level_dicts, level_variables = getattr(self, name)._get_torch_save_params()
             state_dicts += [f"{name}.{part}" for part in level_dicts]
             variables += [f"{name}.{part}" for part in level_variables]
+        if self.reachability is not None:
+            state_dicts += ["reachability", "reachability.optimizer"]
         return state_dicts, variables
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
@@ -367,14 +443,3 @@ class TBCHRL(BaseAlgorithm):
         :raises ValueError: if the file was written for other spaces or sizes
         """
         self.replay_buffer.load(path)
-
-
-class HiTS(TBCHRL):
-    """Hierarchical RL with timed subgoals (Guertler, Buechler, Martius 2021) as a mode of the same code.
-
-    Windows run their full time, the reward is per decision, the low level is an MLP. Parameters as :class:`TBCHRL`.
-    """
-
-    default_window_end: ClassVar[str] = "timed"
-    default_target: ClassVar[str] = "decision"
-    default_circuit: ClassVar[bool] = False

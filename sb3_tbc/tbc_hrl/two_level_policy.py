@@ -14,6 +14,7 @@ from sb3_tbc.layout import GOAL_KEYS, LevelLayout
 from sb3_tbc.options import OptionRules
 from sb3_tbc.spaces import FloatArray
 from sb3_tbc.tbc_hrl.level import SACLevel
+from sb3_tbc.vec_env.hierarchical_vec_env import Schedule
 
 
 class TwoLevelState(NamedTuple):
@@ -37,6 +38,7 @@ class TBCPolicy(BasePolicy):
     :param rules: what ends an option
     :param memory: when the membrane is reset: at each new ``"window"``, ``"episode"``, or at every step (``"none"``)
     :param seed: of the noise that ``predict(deterministic=False)`` draws
+    :param schedule: gives the time budgets where the high level does not
     """
 
     def __init__(
@@ -49,11 +51,12 @@ class TBCPolicy(BasePolicy):
         rules: OptionRules,
         memory: str,
         seed: int | None = None,
+        schedule: Schedule | None = None,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.high_policy, self.low_policy = high.policy, low.policy
         self._levels = (high, low)
-        self.layout, self.rules, self.memory = layout, rules, memory
+        self.layout, self.rules, self.memory, self.schedule = layout, rules, memory, schedule
         self.rng = np.random.default_rng(seed)
 
     def initial_state(self, n_envs: int) -> TwoLevelState:
@@ -110,10 +113,14 @@ class TBCPolicy(BasePolicy):
         now.membrane[forget] = 0.0
         where = np.flatnonzero(over)
         if len(where):
-            seen = self.layout.high({key: batch[key][where] for key in GOAL_KEYS})
+            seen = {key: batch[key][where] for key in GOAL_KEYS}
             no_state = np.zeros((len(where), 0), dtype=np.float32)
-            unit, _ = self._levels[0].act(seen, no_state, deterministic, self.rng, average=deterministic)
+            unit, _ = self._levels[0].act(
+                self.layout.high(seen), no_state, deterministic, self.rng, average=deterministic
+            )
             unit = unit.astype(np.float64)  # as while learning: a rounding error can change the length of a window
+            if self.schedule is not None:
+                unit = self.schedule(unit, seen)
             now.subgoal[where] = self.layout.subgoals.unscale(unit[:, :-1])
             now.time_budget[where] = self.rules.budget(unit[:, -1])
             now.elapsed[where] = 0

@@ -58,11 +58,8 @@ class StepInputs(NamedTuple):
     constants: list[th.Tensor]
     row: Schedules
     noise: th.Tensor
+    labels: list[th.Tensor]  # what the last action coordinate is drawn toward, or none
     batch: LevelBatch
-
-
-N_PER_STEP = 2 + len(LevelBatch._fields)
-"""Arguments that change from update to update: schedules, noise, batch."""
 
 
 class FlatParameters:
@@ -140,10 +137,15 @@ class SACUpdate:
         optimizers replaced by flat ones
     :param ent_coef_optimizer: optimizer of the logarithm of the temperature, None for a fixed temperature
     :param compile: "auto" (compiled if there is a C++ compiler), True or False
+    :param label_coef: weight of the squared distance between the actor's last action coordinate and given labels
     """
 
     def __init__(
-        self, policy: LevelPolicy, ent_coef_optimizer: th.optim.Adam | None = None, compile: bool | str = "auto"
+        self,
+        policy: LevelPolicy,
+        ent_coef_optimizer: th.optim.Adam | None = None,
+        compile: bool | str = "auto",
+        label_coef: float = 0.0,
     ) -> None:
         self.policy = policy
         self.actor = FlatParameters(policy.actor.blocks())
@@ -155,6 +157,7 @@ class SACUpdate:
         self.ent_coef_optimizer = ent_coef_optimizer
         self.action_dim = math.prod(policy.action_space.shape or (1,))
         self.compile = compile
+        self.label_coef = label_coef
         self._steps: dict[tuple[int, int], Callable[..., None]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -178,6 +181,7 @@ class SACUpdate:
         tau: float,
         target_entropy: float,
         ent_coef: th.Tensor,
+        labels: th.Tensor | None = None,
     ) -> dict[str, float]:
         """Run one update per leading index of ``batch``.
 
@@ -187,15 +191,17 @@ class SACUpdate:
         :param tau: Polyak factor
         :param target_entropy: for the automatic temperature, in nats
         :param ent_coef: fixed temperature, or its logarithm when it is automatic
+        :param labels: ``(gradient_steps, batch, 1)`` in [-1, 1], needed where ``label_coef`` is not 0
         :return: mean over the burst of each of :data:`DIAGNOSTICS`
         """
         n_steps = len(batch.rewards)
         batch = LevelBatch(*(x.contiguous() for x in batch))
-        self._check(batch, noise)
+        given = [] if labels is None else [labels.contiguous()]
+        self._check(batch, noise, given)
         stats = th.zeros(len(DIAGNOSTICS))
         state = [stats, ent_coef.data, *self._state()]
         rows = self._schedules(n_steps, tau, target_entropy)
-        bursts = (rows, noise, *batch)
+        bursts = (rows, noise, *given, *batch)
         step = self._step_for([*state, *(x[0] for x in bursts)])
         for inputs in zip(*(x.unbind(0) for x in bursts), strict=True):
             step(*state, *inputs)
@@ -211,14 +217,18 @@ class SACUpdate:
             "schedules": (n_steps, len(Schedules._fields)),
             "noise": (n_steps, 2, batch_size, self.action_dim),
         }
+        if self.label_coef:
+            shapes["labels"] = (n_steps, batch_size, 1)
         for name, width in zip(LevelBatch._fields, widths, strict=True):
             shapes[name] = (n_steps, batch_size, width)
         return shapes
 
-    def _check(self, batch: LevelBatch, noise: th.Tensor) -> None:
+    def _check(self, batch: LevelBatch, noise: th.Tensor, labels: Sequence[th.Tensor]) -> None:
         """The compiled step trusts shapes and types, so they are checked here, once per burst."""
+        if len(labels) != bool(self.label_coef):
+            raise ValueError(f"labels are needed where label_coef is not 0, and only there; it is {self.label_coef}")
         shapes = self._shapes(*batch.rewards.shape[:2])
-        for name, x in (("noise", noise), *batch._asdict().items()):
+        for name, x in (("noise", noise), *(("labels", x) for x in labels), *batch._asdict().items()):
             if tuple(x.shape) != shapes[name] or x.dtype != th.float32:
                 raise ValueError(
                     f"batch.{name} must be float32 of shape {shapes[name]}, got {x.dtype} {tuple(x.shape)}"
@@ -305,11 +315,13 @@ class SACUpdate:
         stats, ent, actor, critic, target, average, *rest = tensors
         n_moments = 2 * len(self.optimizers())
         moments = list(zip(rest[0:n_moments:2], rest[1:n_moments:2], strict=True))
-        row, noise, *batch = rest[-N_PER_STEP:]
-        constants = rest[n_moments:-N_PER_STEP]
+        n_labels = int(bool(self.label_coef))
+        per_step = 2 + n_labels + len(LevelBatch._fields)  # what changes from update to update
+        row, noise, *sampled = rest[-per_step:]
+        constants = rest[n_moments:-per_step]
         return StepInputs(
             stats, ent, actor, critic, target, average, moments, constants,
-            Schedules(*row.unbind()), noise, LevelBatch(*batch),
+            Schedules(*row.unbind()), noise, sampled[:n_labels], LevelBatch(*sampled[n_labels:]),
         )  # fmt: skip
 
     def _sample(
@@ -340,10 +352,15 @@ class SACUpdate:
     def _update_actor(
         self, x: StepInputs, leaf: th.Tensor, actions: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor
     ) -> th.Tensor:
-        """Step on ``alpha log pi - min Q`` through the updated critics; further losses on ``actions`` belong here."""
+        """Step on ``alpha log pi - min Q`` through the updated critics, and on the labels' loss where there are any.
+
+        The latter is the paper's ``L_dt = E (dt - dt*)^2``, in unit coordinates of the action.
+        """
         with th.enable_grad():
             q = self.policy.critic.q_blocks(self.critic.unflatten(x.critic), x.batch.observations, actions)
             loss = (ent_coef * log_prob - q.amin(dim=0)).mean()
+            for labels in x.labels:
+                loss = loss + self.label_coef * (actions[:, -1:] - labels).square().mean()
             (grad,) = th.autograd.grad(loss, leaf)
         self._adam(0, x.actor, grad, x, x.row.actor_step)
         return loss

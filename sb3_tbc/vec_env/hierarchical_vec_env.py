@@ -21,12 +21,15 @@ from sb3_tbc.vec_env.recorder import EpisodeRecorder
 class Proposal(NamedTuple):
     """What the high level answers when asked for options: one row per environment that needs one."""
 
-    unit_actions: FloatArray  # (n, subgoal_dim + 1) in [-1, 1]: subgoal, then time budget
+    unit_actions: FloatArray  # (n, subgoal_dim + 1) in [-1, 1]: subgoal, then time budget unless a schedule gives it
     testing: NDArray[np.bool_]  # (n,), whether the option is a subgoal test
 
 
 HighLevel = Callable[[FloatArray, NDArray[np.intp]], Proposal]
 """Maps high-level observations ``(n, high_dim)`` of the environments ``(n,)`` to their next options."""
+
+Schedule = Callable[[FloatArray, GoalObservation], FloatArray]
+"""Appends unit time budgets to unit subgoals ``(n, subgoal_dim)`` chosen at goal observations."""
 
 
 class HierarchicalVecEnv(VecEnvWrapper):
@@ -41,7 +44,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
     :param layout: how the levels' observations are put together
     :param rules: what ends an option
     :param state_dim: width of the low level's memory to record with each step
-    :param record: keep whole episodes for learning; without it :attr:`episodes` stays empty
+    :param schedule: gives the time budgets where the high level does not
     :raises ValueError: if the environments are not goal environments or their actions not a Box
     """
 
@@ -52,12 +55,14 @@ class HierarchicalVecEnv(VecEnvWrapper):
         layout: LevelLayout,
         rules: OptionRules,
         state_dim: int = 0,
+        schedule: Schedule | None = None,
     ) -> None:
         space = check_goal_space(venv.observation_space)
         super().__init__(venv, observation_space=layout.low_space(), action_space=venv.action_space)
         self.high_level = high_level
         self.layout = layout
         self.rules = rules
+        self.schedule = schedule
         self.clock = OptionClock(venv.num_envs, layout.subgoals.dim, rules)
         self.episodes: list[Episode] = []
         self._everywhere = np.arange(venv.num_envs)
@@ -114,7 +119,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
             where = np.flatnonzero(ended)
             low_rewards[where] = self._close_options(where, seen, reached, dones, infos)
             self._next_options(where, observation, dones, infos)  # type: ignore[arg-type]
-        return self._low_observation(observation), low_rewards, ended, infos
+        return self._low_observation(observation), low_rewards, ended, infos  # type: ignore[arg-type]
 
     def _unit_actions(self, actions: FloatArray) -> FloatArray:
         low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
@@ -206,8 +211,8 @@ class HierarchicalVecEnv(VecEnvWrapper):
             raise HierarchyError("HierarchicalVecEnv needs a high level that proposes options: set .high_level")
         seen = {key: observation[key][where] for key in GOAL_KEYS}
         proposal = self.high_level(self.layout.high(seen), where)
-        subgoal = self.layout.subgoals.unscale(proposal.unit_actions[:, :-1])
-        self.clock.begin(where, proposal.unit_actions, subgoal, proposal.testing)
+        unit = proposal.unit_actions if self.schedule is None else self.schedule(proposal.unit_actions, seen)
+        self.clock.begin(where, unit, self.layout.subgoals.unscale(unit[:, :-1]), proposal.testing)
 
     def _low_observation(self, observation: GoalObservation) -> FloatArray:
         remaining = self.rules.remaining(self.clock.time_left)
