@@ -15,7 +15,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.evaluation import evaluate_hierarchical
+from sb3_tbc.evaluation import evaluate_agent
+from sb3_tbc.flat import FlatSAC
 from sb3_tbc.tbc_hrl import TBCHRL
 
 
@@ -149,9 +150,9 @@ class SuccessEvalCallback(EventCallback):
 
     def evaluate(self) -> EvaluationRow:
         """Evaluate now, record the row, keep the agent if it is the best."""
-        if not isinstance(self.model, TBCHRL):
-            raise TypeError(f"SuccessEvalCallback evaluates two-level agents, got {type(self.model).__name__}")
-        result = evaluate_hierarchical(
+        if not isinstance(self.model, (TBCHRL, FlatSAC)):
+            raise TypeError(f"SuccessEvalCallback evaluates this package's agents, got {type(self.model).__name__}")
+        result = evaluate_agent(
             self.model, self.eval_env, self.n_eval_episodes, seed=self.seed + 1000 * len(self.rows), deterministic=True
         )
         row = EvaluationRow(

@@ -12,7 +12,7 @@ import torch as th
 from sb3_tbc.callbacks import write_atomic
 from sb3_tbc.cli import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.evaluation import evaluate_hierarchical
+from sb3_tbc.evaluation import evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, load_model, read_zip
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import summarise, to_json
@@ -64,7 +64,7 @@ def evaluate(
     env = evaluation_envs(info["env_id"], n_episodes, seed, info["env_kwargs"])
     try:
         model = load_model(path, env, device)
-        result = evaluate_hierarchical(model, env, n_episodes, seed=seed, deterministic=not stochastic)
+        result = evaluate_agent(model, env, n_episodes, seed=seed, deterministic=not stochastic)
     finally:
         env.close()
     identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}

@@ -10,7 +10,7 @@ from sb3_tbc.callbacks import save_atomic, write_atomic
 from sb3_tbc.cli import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export_policy import Circuit, ExportedPolicy, extract
-from sb3_tbc.zoo.algorithms import load_model
+from sb3_tbc.zoo.algorithms import load_two_levels
 
 SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
 
@@ -69,7 +69,9 @@ def describe(policy: ExportedPolicy) -> str:
 def command(argv: Sequence[str]) -> int:
     """Export; see ``--help``."""
     args = build_parser().parse_args(argv)
-    model = load_model(args.model)
+    model = load_two_levels(args.model)
+    if model.schedule is not None or not model.remaining_time:
+        raise ConfigError(f"{args.model}: only agents that choose their time budgets and see the rest can be exported")
     path = args.output or args.model.with_suffix(SUFFIXES[args.format])
     policy = extract(model, args.model.stem)
     WRITERS[args.format](policy, path)

@@ -104,6 +104,7 @@ def success_table(results: Results) -> list[list[str]]:
         "window",
         "to 0.9",
         "stable",
+        "worst",
     ]
     table = [header]
     for task, methods in results.items():
@@ -129,7 +130,13 @@ def _success_row(task: str, method: str, runs: Sequence[Run]) -> list[str]:
         _mean(runs, "mean_window", "{:.1f}"),
         to_90,
         _mean(runs, "stable_share", "{:.2f}"),
+        _worst(runs),
     ]
+
+
+def _worst(runs: Sequence[Run]) -> str:
+    values = [run.final["worst_after_first_90"] for run in runs if run.final.get("worst_after_first_90") is not None]
+    return f"{min(values):.2f}" if values else "-"
 
 
 def _mean(runs: Sequence[Run], key: str, form: str) -> str:
@@ -201,7 +208,7 @@ NOTES = (
     "The seed is the unit: intervals are percentile bootstraps over seeds (10,000 resamples). Length: mean steps of "
     "successful episodes. Subgoals: share of windows that reached theirs. Window: mean executed length in steps. "
     "To 0.9: steps until an evaluation first succeeds in 0.9 of its episodes. Stable: share of evaluations at 0.9 "
-    "or more from then on."
+    "or more from then on, mean over seeds. Worst: the lowest of these evaluations, of all seeds."
 )
 
 

@@ -14,6 +14,7 @@ import torch as th
 
 from sb3_tbc.cli import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm
 from sb3_tbc.zoo.config import CONFIGS, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env
@@ -24,7 +25,7 @@ from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, sta
 def build_parser() -> Parser:
     """The command's arguments."""
     parser = Parser("sb3_tbc.train", description=__doc__)
-    parser.add_argument("--algo", default="tbc-hrl", help="tbc-hrl or hits")
+    parser.add_argument("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
     parser.add_argument("--env", default="Pendulum", help="a task's short name or any registered goal environment id")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--n-timesteps", type=positive_int, help="environment steps; by default the paper's (table 1)")
@@ -64,6 +65,10 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
     overrides = parse_overrides(args.hyperparams)
     config, file = config_and_file(args)
     run = load_config(args.algo, task, config, overrides, args.ablation, file)
+    if args.ablation is not None:
+        matched = match_parameters(run, load_config(args.algo, task, config, overrides, None, file), env_id)
+        print(f"{args.ablation}: {matched}")
+        run = matched.run
     run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
     return RunSpec(
         run,

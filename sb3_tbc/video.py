@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.evaluation import Agent
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.two_level_policy import TwoLevelState
 
 Frame = NDArray[np.uint8]
 
 
-def episode_frames(model: TBCHRL, env: gym.Env[Any, Any], seed: int | None = None) -> Iterator[Frame]:
+def episode_frames(model: Agent, env: gym.Env[Any, Any], seed: int | None = None) -> Iterator[Frame]:
     """Frames of one deterministic episode, one per step and one at the end, each ``(height, width, 3)``.
 
     The episode ends as in an evaluation: success, time limit, or the high level's action budget used up.
@@ -32,13 +33,14 @@ def episode_frames(model: TBCHRL, env: gym.Env[Any, Any], seed: int | None = Non
     overlay = getattr(env.unwrapped, "set_overlay", None)
     while not over:
         action, carried = model.predict(observation, state, start, deterministic=True)
-        live = TwoLevelState(*carried) if carried is not None else model.policy.initial_state(1)
-        if live.used[0] > model.max_options:
-            result = "action budget used up"
-            break
-        if overlay is not None:
-            left = model.rules.remaining(live.time_budget - live.elapsed + 1)
-            overlay(live.subgoal[0], float(left[0]), f"option {live.used[0]} of {model.max_options}")
+        if isinstance(model, TBCHRL) and carried is not None:
+            live = TwoLevelState(*carried)
+            if live.used[0] > model.max_options:
+                result = "action budget used up"
+                break
+            if overlay is not None:
+                left = model.rules.remaining(live.time_budget - live.elapsed + 1)
+                overlay(live.subgoal[0], float(left[0]), f"option {live.used[0]} of {model.max_options}")
         yield _frame(env)
         observation, _, terminated, truncated, info = env.step(action)
         state, start = carried, np.array([False])
@@ -56,7 +58,7 @@ def _frame(env: gym.Env[Any, Any]) -> Frame:
 
 
 def record_video(
-    model: TBCHRL,
+    model: Agent,
     env_id: str,
     path: Path,
     n_episodes: int = 3,

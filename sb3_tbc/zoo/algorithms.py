@@ -10,16 +10,19 @@ from typing import Any
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.tbc_hrl import TBCHRL, HiTS
+from sb3_tbc.flat import FlatSAC
+from sb3_tbc.tbc_hrl import HAC, TBCHRL, HiTS
 from sb3_tbc.zoo.config import RunConfig
+from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.schema import nearest
 
-ALGORITHMS: dict[str, type[TBCHRL]] = {"tbc-hrl": TBCHRL, "hits": HiTS}
+Agent = TBCHRL | FlatSAC
+ALGORITHMS: dict[str, type[TBCHRL] | type[FlatSAC]] = {"tbc-hrl": TBCHRL, "hits": HiTS, "hac": HAC, "sac": FlatSAC}
 RUN_INFO = "run_info"
 """Attribute, and key in the ``.zip``, with what the runner knows of a run: task, environment, variant, seed."""
 
 
-def algorithm(name: str) -> type[TBCHRL]:
+def algorithm(name: str) -> type[TBCHRL] | type[FlatSAC]:
     """The class of an algorithm.
 
     :raises ConfigError: naming the nearest known one
@@ -29,7 +32,7 @@ def algorithm(name: str) -> type[TBCHRL]:
     return ALGORITHMS[name]
 
 
-def build_model(run: RunConfig, env: VecEnv, seed: int, **options: Any) -> TBCHRL:
+def build_model(run: RunConfig, env: VecEnv, seed: int, **options: Any) -> Agent:
     """Build the agent of a configuration.
 
     :param run: what to build
@@ -77,22 +80,38 @@ def algorithm_of(path: Path, data: dict[str, Any]) -> str:
         return str(name)
     origin = policy.get("__module__") if isinstance(policy, dict) else None
     if name is None and str(origin).startswith("sb3_tbc.tbc_hrl"):  # saved by model.save, without the runner
+        if data.get("low_reward") == HAC.default_low_reward:
+            return "hac"
         return "hits" if data.get("target") == HiTS.default_target else "tbc-hrl"
     raise ConfigError(
         f"{path} holds an agent of another algorithm ({name or origin or 'unknown'}), not of {', '.join(ALGORITHMS)}"
     )
 
 
-def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu") -> TBCHRL:
+def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu") -> Agent:
     """Load an agent of any of our algorithms.
 
     :param path: the ``.zip``
-    :param env: environments to act in
+    :param env: environments to act in; an agent that needs some to be loaded gets those it was trained on
     :param device: torch device
     :raises ConfigError: if it cannot be loaded
     """
-    name = algorithm_of(path, read_zip(path))
+    data = read_zip(path)
+    name = algorithm_of(path, data)
     try:
+        if env is None and ALGORITHMS[name] is FlatSAC:
+            env = make_envs(data[RUN_INFO]["env_id"], 1, None, data[RUN_INFO]["env_kwargs"])
         return ALGORITHMS[name].load(path, env=env, device=device)
     except (ValueError, TypeError, KeyError, RuntimeError) as error:
         raise ConfigError(f"cannot load {path} as {name}: {error}") from error
+
+
+def load_two_levels(path: Path, env: VecEnv | None = None, device: str = "cpu") -> TBCHRL:
+    """Load an agent that has subgoals.
+
+    :raises ConfigError: if it cannot be loaded or has none
+    """
+    model = load_model(path, env, device)
+    if not isinstance(model, TBCHRL):
+        raise ConfigError(f"{path} holds a flat agent, without the two levels that are needed here")
+    return model

@@ -14,8 +14,16 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.zoo.schema import RUN, SECTION, coerce, nearest, validate
 
 CONFIGS = ("paper", "tuned")
-ABLATIONS: dict[str, dict[str, Any]] = {}
-"""Ablation name -> what it overrides, merged after the task's section."""
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "no-ts": {"duration": "fixed", "remaining_time": False, "target": "decision", "duration_loss_coef": 0.0},
+    "no-ndbc": {"low": {"policy_kwargs": {"ndbc": None}}, "sequence_length": 1},
+}
+"""Ablation name -> what it overrides, merged after the task's section.
+
+``no-ts`` takes timed scheduling out: windows of a constant length (``dt_max``), no remaining time for the low level to
+see, one discount per decision in place of ``gamma ** tau``. ``no-ndbc`` gives the low level an MLP. Both keep the full
+model's number of parameters, see :mod:`sb3_tbc.zoo.ablations`.
+"""
 
 
 @dataclass(frozen=True)
@@ -140,7 +148,9 @@ def load_config(
     if config not in CONFIGS:
         raise ConfigError(f"configuration must be one of {', '.join(CONFIGS)}, got {config!r}")
     if ablation is not None and ablation not in ABLATIONS:
-        raise ConfigError(f"no ablation {ablation!r}; {nearest(ablation, ABLATIONS) if ABLATIONS else 'none yet'}")
+        raise ConfigError(f"no ablation {ablation!r}; {nearest(ablation, ABLATIONS)}")
+    if ablation is not None and algo != "tbc-hrl":
+        raise ConfigError(f"ablations are of tbc-hrl, there is none of {algo!r}")
     merged = merge(default, section)
     for change in (tuned if config == "tuned" else {}, ABLATIONS.get(ablation or "", {}), overrides or {}):
         merged = merge(merged, change)

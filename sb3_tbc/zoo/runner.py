@@ -21,9 +21,8 @@ from sb3_tbc.callbacks import (
     write_atomic,
 )
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.evaluation import evaluate_hierarchical
-from sb3_tbc.tbc_hrl import TBCHRL
-from sb3_tbc.zoo.algorithms import RUN_INFO, build_model, load_model
+from sb3_tbc.evaluation import evaluate_agent
+from sb3_tbc.zoo.algorithms import RUN_INFO, Agent, build_model, load_model
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise, to_json
@@ -190,7 +189,7 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
 
 
 def _learn(
-    model: TBCHRL,
+    model: Agent,
     spec: RunSpec,
     folder: RunFolder,
     options: RunOptions,
@@ -238,17 +237,17 @@ def _learn(
     return result
 
 
-def _train(model: TBCHRL, n_timesteps: int, callback: BaseCallback, progress: bool) -> None:
+def _train(model: Agent, n_timesteps: int, callback: BaseCallback, progress: bool) -> None:
     fresh = model.num_timesteps == 0
     model.learn(n_timesteps - model.num_timesteps, callback=callback, reset_num_timesteps=fresh, progress_bar=progress)
 
 
-def _final(model: TBCHRL, spec: RunSpec, folder: RunFolder, trained: float) -> dict[str, Any]:
+def _final(model: Agent, spec: RunSpec, folder: RunFolder, trained: float) -> dict[str, Any]:
     """Evaluate the trained agent as ``python -m sb3_tbc.evaluate`` does, on ``eval_seed``."""
     seed = spec.seed + FINAL_SEED
     env = evaluation_envs(spec.env_id, spec.n_final_episodes, seed, spec.run.env_kwargs)
     try:
-        result = evaluate_hierarchical(model, env, spec.n_final_episodes, seed=seed, deterministic=True)
+        result = evaluate_agent(model, env, spec.n_final_episodes, seed=seed, deterministic=True)
     finally:
         env.close()
     return {
@@ -262,7 +261,7 @@ def _final(model: TBCHRL, spec: RunSpec, folder: RunFolder, trained: float) -> d
     }
 
 
-def _save_checkpoint(model: TBCHRL, folder: RunFolder, wall_time: float) -> None:
+def _save_checkpoint(model: Agent, folder: RunFolder, wall_time: float) -> None:
     """Agent, replay buffers and clock, written aside and then swapped in: they always belong together."""
     new, old = folder.path / f"checkpoint.new{os.getpid()}", folder.path / "checkpoint.old"
     shutil.rmtree(new, ignore_errors=True)

@@ -38,6 +38,7 @@ LEVEL: Schema = {
     "target_entropy": (int, float, str),
     "buffer_size": int,
     "n_hindsight_goals": NUMBER,
+    "goal_strategy": frozenset({"future", "episode"}),
     "policy_kwargs": POLICY,
 }
 RUN: Schema = {"n_timesteps": int, "n_envs": int, "env_kwargs": dict}
@@ -49,25 +50,41 @@ MODEL: Schema = {
     "window_end": frozenset({"timed", "reached"}),
     "dt_min": NUMBER,
     "dt_max": NUMBER,
+    "duration": frozenset({"joint", "rule", "fixed"}),
+    "fixed_duration": NUMBER,
+    "kappa": NUMBER,
+    "duration_loss_coef": NUMBER,
+    "remaining_time": bool,
     "target": frozenset({"smdp", "decision"}),
     "decision_cost": NUMBER,
     "duration_cost": NUMBER,
+    "completion_bonus": NUMBER,
+    "low_reward": frozenset({"sparse", "dense", "step"}),
     "testing_fraction": NUMBER,
     "deterministic_testing": bool,
     "testing_penalty": NUMBER,
     "relative_subgoals": bool,
     "keep_original": bool,
+    "relabel_tolerance": NUMBER,
     "random_fraction": NUMBER,
     "n_hindsight_goals": NUMBER,
     "goal_strategy": frozenset({"future", "episode"}),
     "gradient_ratio": NUMBER,
     "learning_starts": int,
     "memory": frozenset({"window", "episode", "none"}),
+    "sequence_length": int,
     "compile": (bool, str),
     "high": LEVEL,
     "low": LEVEL,
 }
-SECTION: Schema = {**RUN, **MODEL}
+FLAT: Schema = {
+    **{key: LEVEL[key] for key in ("learning_rate", "batch_size", "gamma", "tau", "ent_coef", "target_entropy")},
+    "buffer_size": int,
+    "policy_kwargs": {"net_arch": (list, dict)},
+}
+"""What an agent of one level takes at the top of a section, besides some of :data:`MODEL`'s keys."""
+
+SECTION: Schema = {**RUN, **MODEL, **FLAT}
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
