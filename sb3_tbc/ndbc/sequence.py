@@ -63,7 +63,9 @@ class UnrolledCell(th.autograd.Function):
         """Gradients of all tensors :meth:`forward` takes, the mask excepted."""
         recurrent, pace, *saved = ctx.saved_tensors
         mask = saved.pop(0) if ctx.has_mask else None
-        k, presynaptic, back = ctx.sub_steps, recurrent.shape[1], recurrent.t().contiguous()
+        n = len(recurrent) // 2
+        sign = th.cat((recurrent.new_ones(n, 1), -recurrent.new_ones(n, 1)))
+        k, presynaptic, back = ctx.sub_steps, recurrent.shape[1], (recurrent * sign).t().contiguous()
         steps_of_time = grad.unbind(1)
         grad_state = th.zeros_like(steps_of_time[0])
         grad_pace, grad_rest = th.zeros_like(grad_state), th.zeros_like(grad_state)
@@ -76,12 +78,12 @@ class UnrolledCell(th.autograd.Function):
                 released, total, after = steps[3 * s : 3 * s + 3]
                 start = steps[3 * s - 1] if s else before
                 quotient = grad_state / total
-                pull = th.cat((quotient, (quotient * after).neg_()))  # d weighted | d total
+                pull = th.cat((quotient, quotient * after))  # d weighted | -d total
                 excite = th.ops.aten.sigmoid_backward(back @ pull, released)
                 grad_state = quotient * pace
-                grad_state[:presynaptic] += excite
-                grad_pace = grad_pace.addcmul_(quotient, start)
-                grad_recurrent = grad_recurrent.addmm_(pull, released.t())
+                grad_state[:presynaptic].add_(excite)
+                grad_pace.addcmul_(quotient, start)
+                grad_recurrent.addmm_(pull, released.t())
                 pulls = pulls + pull if s < k - 1 else pull
             grad_drive.append(pulls)
             if mask is not None:
@@ -89,7 +91,9 @@ class UnrolledCell(th.autograd.Function):
                 grad_state = grad_state * mask[t]
         grad_drive.reverse()
         grad_rest, grad_pace = grad_rest.sum(dim=1, keepdim=True), grad_pace.sum(dim=1, keepdim=True)
-        return th.stack(grad_drive, dim=1), grad_state, None, grad_rest, grad_recurrent, grad_pace, None
+        stacked = th.stack(grad_drive, dim=1)
+        stacked[n:].neg_()
+        return stacked, grad_state, None, grad_rest, grad_recurrent * sign, grad_pace, None
 
 
 class Unrolled(NamedTuple):
