@@ -63,6 +63,7 @@ def build_parser() -> Parser:
     add("--device", default="cpu")
     add("--trial", metavar="best|N", help="train from this trial, on its settings and --seed, instead of searching")
     add("--seed", type=int, default=0, help="with --trial: of the training")
+    add("--overwrite", action="store_true", help="with --trial: replace an earlier run of that trial and seed")
     same = parser.add_argument_group("what trials share; fixed when a study begins, and not needed to resume it")
     add = same.add_argument
     add("--n-seeds", type=positive_int, help="training runs per trial (2)")
@@ -268,7 +269,7 @@ def train_from(args: argparse.Namespace, study: Study, settings: StudySettings, 
     arguments = train_arguments(settings, path, args.seed)
     arguments += ["--log-folder", str(folder / "train"), "--device", args.device]
     arguments += ["--n-timesteps", str(args.n_timesteps)] if args.n_timesteps else []
-    return train.command(arguments)
+    return train.command([*arguments, *(["--overwrite"] if args.overwrite else [])])
 
 
 def main(argv: Sequence[str] | None = None) -> int:

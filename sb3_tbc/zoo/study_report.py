@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -112,8 +113,10 @@ def importances(study: Study) -> dict[str, float]:
     if len(complete_trials(study)) < 4:
         return {}
     try:
-        evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-        found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # few trials make it inaccurate: the docs say so once
+            evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+            found = optuna.importance.get_param_importances(study, evaluator=evaluator)
     except (ValueError, RuntimeError):
         return {}  # e.g. every trial has the same value
     return {name: share for name, share in found.items() if math.isfinite(share)}
