@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from scripted_policies import episode_length, servo
 from stable_baselines3.common.env_checker import check_env
 
@@ -77,6 +78,7 @@ def test_nothing_leaks_over_reset(bullet):
 @pytest.mark.filterwarnings("ignore")
 def test_checker_and_bad_actions(bullet):
     check_env(bullet, skip_render_check=True)
+    gymnasium_check_env(gym.make("sb3_tbc/UR5ReacherBullet-v0").unwrapped, skip_render_check=True)
     bullet.reset(seed=0)
     with pytest.raises(ValueError, match="finite"):
         bullet.step(np.array([np.nan, 0, 0]))

@@ -46,7 +46,7 @@ def test_picture_shows_subgoal_and_time(task):
     assert bare.dtype == np.uint8
     assert bare.ndim == 3
     assert bare.shape[2] == 3
-    assert len(np.unique(bare.reshape(-1, 3), axis=0)) > 5
+    assert bare.std() > 5
     assert count(bare, GOAL) > 100
     assert count(bare, SUBGOAL) == 0
     ring = slice(0, 64), slice(bare.shape[1] - 64, None)
