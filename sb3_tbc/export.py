@@ -10,6 +10,7 @@ from sb3_tbc.callbacks import save_atomic, write_atomic
 from sb3_tbc.cli import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export_policy import Circuit, ExportedPolicy, extract
+from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.algorithms import load_two_levels
 
 SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
@@ -73,6 +74,8 @@ def command(argv: Sequence[str]) -> int:
     if model.schedule is not None or not model.remaining_time:
         raise ConfigError(f"{args.model}: only agents that choose their time budgets and see the rest can be exported")
     path = args.output or args.model.with_suffix(SUFFIXES[args.format])
+    if not isinstance(model, TBCHRL):
+        raise ConfigError(f"{args.model} holds {type(model).__name__}, which has one level: only two-level agents")
     policy = extract(model, args.model.stem)
     WRITERS[args.format](policy, path)
     print(f"{describe(policy)}\nwritten: {path}")

@@ -29,6 +29,10 @@ def to_c(policy: ExportedPolicy) -> str:
         "HIGH_INPUTS": _high_inputs(policy),
         "FORGET": {"window": "over", "episode": "started", "none": "1"}[policy.memory],
         "ASKED": "state->subgoal[i] - here[i]" if policy.relative_subgoals else "state->subgoal[i]",
+        "UNITS": str(policy.subgoal_dim + (policy.fixed_budget is None)),
+        "BUDGET": _CHOSEN if policy.fixed_budget is None else repr(policy.fixed_budget),
+        "REMAINING": _REMAINING if policy.remaining_time else "",
+        "LOCAL": str(len(policy.local)),
     }
     text = _template("export_policy.c")
     for name, value in values.items():
@@ -97,6 +101,10 @@ def _circuit(c: Circuit) -> str:
     return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
 
 
+_CHOSEN = """TBC_DT_MIN
+        + 0.5 * ((double)squash(unit[TBC_SUBGOAL], TBC_HIGH_BOUND) + 1.0) * (TBC_DT_MAX - TBC_DT_MIN)"""
+_REMAINING = """
+    seen[TBC_LOW_INPUT - 1] = (float)fmax(0.0, fmin((state->time_budget - state->elapsed) / TBC_DT_MAX, 1.0));"""
 _LOW_MLP = """
 void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT], int closed_form,
                   float mean[TBC_ACTION])

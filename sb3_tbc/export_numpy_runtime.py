@@ -45,7 +45,8 @@ def step(observation: Array, achieved_goal: Array, desired_goal: Array, state: S
         _begin(observation, achieved_goal, desired_goal, state)
     asked = state["subgoal"] - here if SETTINGS["relative_subgoals"] else state["subgoal"]
     remaining = np.clip((state["time_budget"] - state["elapsed"]) / SETTINGS["dt_max"], 0.0, 1.0)
-    seen = np.concatenate([entries[list(SETTINGS["local"])], asked, [remaining]]).astype(np.float32)
+    parts = [entries[list(SETTINGS["local"])], asked] + ([[remaining]] if SETTINGS["remaining_time"] else [])
+    seen = np.concatenate(parts).astype(np.float32)
     if SETTINGS["low.kind"] == "mlp":
         mean = _mlp("low", seen)
     else:
@@ -62,8 +63,10 @@ def _begin(observation: Array, achieved_goal: Array, desired_goal: Array, state:
     parts = [desired_goal, observation] + ([] if SETTINGS["achieved_in_observation"] else [achieved_goal])
     unit = _squash(_mlp("high", np.concatenate(parts).astype(np.float32)), 0).astype(np.float64)
     low, high = ARRAYS["subgoal_low"], ARRAYS["subgoal_high"]
-    state["subgoal"] = low + 0.5 * (unit[:-1] + 1.0) * (high - low)
-    state["time_budget"] = SETTINGS["dt_min"] + 0.5 * (unit[-1] + 1.0) * (SETTINGS["dt_max"] - SETTINGS["dt_min"])
+    state["subgoal"] = low + 0.5 * (unit[: len(low)] + 1.0) * (high - low)
+    state["time_budget"] = SETTINGS["fixed_budget"]
+    if state["time_budget"] is None:
+        state["time_budget"] = SETTINGS["dt_min"] + 0.5 * (unit[-1] + 1.0) * (SETTINGS["dt_max"] - SETTINGS["dt_min"])
     state["elapsed"] = 0
 
 

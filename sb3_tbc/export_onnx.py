@@ -77,7 +77,7 @@ def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
     asked = g("Sub", subgoal, here) if policy.relative_subgoals and here else subgoal
     left = g("Div", g("Sub", budget, elapsed), g.constant(policy.dt_max, np.float64))
     remaining = g.cast(g("Clip", left, zero, g.constant(1.0, np.float64)), TensorProto.FLOAT)
-    seen = g.join(g.columns(entries, policy.local), asked, remaining)
+    seen = g.join(g.columns(entries, policy.local), asked, *([remaining] if policy.remaining_time else []))
     mean = _low(g, policy, seen, over, started)
     unit = _squash(g, mean, policy.mean_bounds[1])
     half = 0.5 * (policy.action_high - policy.action_low)
@@ -93,6 +93,8 @@ def _high(g: _Graph, policy: ExportedPolicy) -> tuple[str, str]:
     d = policy.subgoal_dim
     half = 0.5 * (policy.subgoal_high - policy.subgoal_low)
     subgoal = g.affine(g.slice(unit, 0, d), half, policy.subgoal_low + half)
+    if policy.fixed_budget is not None:
+        return subgoal, g.constant([[policy.fixed_budget]], np.float64)
     span = 0.5 * (policy.dt_max - policy.dt_min)
     budget = g.affine(g.cast(g.slice(unit, d, d + 1), TensorProto.DOUBLE), span, policy.dt_min + span, np.float64)
     return subgoal, budget

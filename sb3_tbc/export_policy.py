@@ -16,6 +16,7 @@ from sb3_tbc.ndbc.cell import ConductanceCell
 from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.policies import MLPActor, NDBCActor
+from sb3_tbc.tbc_hrl.scheduling import ReachRule
 
 FloatArray = NDArray[np.floating[Any]]
 ACTIVATIONS = {nn.ReLU: "relu", nn.Tanh: "tanh"}
@@ -102,6 +103,8 @@ class ExportedPolicy:
     memory: str
     achieved_in_observation: bool
     relative_subgoals: bool
+    remaining_time: bool  # whether the low level sees it
+    fixed_budget: float | None  # steps of every window where the high level does not choose them
     action_low: FloatArray
     action_high: FloatArray
 
@@ -118,7 +121,7 @@ class ExportedPolicy:
     @property
     def n_low_inputs(self) -> int:
         """Entries of the low level's observation: local state, subgoal, remaining time."""
-        return len(self.local) + self.subgoal_dim + 1
+        return len(self.local) + self.subgoal_dim + int(self.remaining_time)
 
     def plain(self) -> dict[str, Any]:
         """All fields as dictionaries, numbers and arrays."""
@@ -133,8 +136,9 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     :raises ConfigError: if something in the model has no exported form, saying what
     """
     layout, rules, subgoals = model.layout, model.rules, model.layout.subgoals
-    if getattr(layout, "observe_budget", False):
-        raise ConfigError("an agent whose high level observes the action budget cannot be exported yet")
+    if isinstance(model.schedule, ReachRule):
+        raise ConfigError("an agent with duration='rule' cannot be exported: its windows come from another network")
+    unit_time = None if model.schedule is None else model.schedule.unit
     sizes = {f"n_{key}": _width(model, name) for key, name in GOAL_PARTS.items()}
     probe = _Probe(sizes["n_observation"], sizes["n_achieved"])
     needed = rules.window_end == "reached" or layout.relative_subgoals
@@ -159,6 +163,8 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
         memory=model.memory,
         achieved_in_observation=layout.achieved_in_observation,
         relative_subgoals=layout.relative_subgoals,
+        remaining_time=layout.remaining_time,
+        fixed_budget=None if unit_time is None else float(rules.budget(np.array(unit_time))),
         action_low=actions.low.astype(np.float64),
         action_high=actions.high.astype(np.float64),
         **sizes,

@@ -66,7 +66,7 @@ static int reached(const float *here, const float *subgoal)
 static void begin_option(tbc_state *state, const float *observation, const float *achieved_goal,
                          const float *desired_goal)
 {
-    float unit[TBC_SUBGOAL + 1];
+    float unit[@UNITS@];
     int i;
 @HIGH_INPUTS@
     high_network(seen, unit);
@@ -74,8 +74,7 @@ static void begin_option(tbc_state *state, const float *observation, const float
         const float half = 0.5f * (squash(unit[i], TBC_HIGH_BOUND) + 1.0f);
         state->subgoal[i] = subgoal_low[i] + half * (subgoal_high[i] - subgoal_low[i]);
     }
-    state->time_budget = TBC_DT_MIN
-        + 0.5 * ((double)squash(unit[TBC_SUBGOAL], TBC_HIGH_BOUND) + 1.0) * (TBC_DT_MAX - TBC_DT_MIN);
+    state->time_budget = @BUDGET@;
     state->elapsed = 0;
 }
 
@@ -90,9 +89,8 @@ void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
               int closed_form, float action[TBC_ACTION])
 {
     float entries[TBC_OBSERVATION + TBC_ACHIEVED_GOAL], here[TBC_SUBGOAL], seen[TBC_LOW_INPUT], mean[TBC_ACTION];
-    const int n_local = TBC_LOW_INPUT - TBC_SUBGOAL - 1;
+    const int n_local = @LOCAL@;
     const int started = state->elapsed < 0;
-    double remaining;
     int i, over;
 
     memcpy(entries, observation, TBC_OBSERVATION * sizeof(float));
@@ -111,9 +109,7 @@ void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
     }
     for (i = 0; i < TBC_SUBGOAL; ++i) {
         seen[n_local + i] = @ASKED@;
-    }
-    remaining = (state->time_budget - state->elapsed) / TBC_DT_MAX;
-    seen[TBC_LOW_INPUT - 1] = (float)fmax(0.0, fmin(remaining, 1.0));
+    }@REMAINING@
     tbc_low_mean(state->membrane, seen, closed_form, mean);
     for (i = 0; i < TBC_ACTION; ++i) {
         const float half = 0.5f * (squash(mean[i], TBC_LOW_BOUND) + 1.0f);
