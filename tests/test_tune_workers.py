@@ -52,8 +52,8 @@ def kill_one_worker_within_a_trial(folder: Path, storage: str) -> tuple[optuna.S
     try:
         wait_for(lambda: log.read_text().count(" begins") >= 2, 120, log)
         study = optuna.load_study(study_name=NAME, storage=open_storage(storage, GRACE))
-        victims = [t for t in study.trials if t.state == TrialState.RUNNING and WORKER in t.user_attrs]
-        victim = victims[-1]
+        wait_for(lambda: bool(training(study, folder)), 60, log)
+        victim = training(study, folder)[-1]
         os.kill(int(victim.user_attrs[WORKER].rpartition(":")[2]), signal.SIGKILL)
         assert process.wait(180) == 0, log.read_text()
     finally:
@@ -61,6 +61,12 @@ def kill_one_worker_within_a_trial(folder: Path, storage: str) -> tuple[optuna.S
             os.killpg(process.pid, signal.SIGKILL)
     assert "ended with signal 9; its trial will be run again by another" in log.read_text()
     return study, victim.number
+
+
+def training(study: optuna.Study, folder: Path) -> list[optuna.trial.FrozenTrial]:
+    """Trials whose first seed is being trained, so all parameters are chosen."""
+    running = [t for t in study.trials if t.state == TrialState.RUNNING and WORKER in t.user_attrs]
+    return [t for t in running if (folder / NAME / f"trial_{t.number:04d}" / "seed_0" / "config.yml").is_file()]
 
 
 def check(study: optuna.Study, killed: int) -> None:
