@@ -14,7 +14,7 @@ from sb3_tbc.cli import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.evaluation import evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, load_model, read_zip
-from sb3_tbc.zoo.environments import resolve_env
+from sb3_tbc.zoo.environments import NAMESPACE, resolve_env
 from sb3_tbc.zoo.ledger import summarise, to_json
 from sb3_tbc.zoo.runner import evaluation_envs
 
@@ -47,8 +47,10 @@ def identify(path: Path, env: str | None) -> dict[str, Any]:
     info = {"algo": algorithm_of(path, data), "variant": "full", "config": "custom", "seed": data.get("seed"), **saved}
     if env is not None:
         task, env_id = resolve_env(env)
-        same = env_id == info.get("env_id")
-        info.update(task=task, env_id=env_id, env_kwargs=info["env_kwargs"] if same else {})
+        # Our own tasks take the same arguments, so a policy sees the layout it was trained with in another engine, too.
+        own = all(str(i).startswith(NAMESPACE) for i in (env_id, info.get("env_id")))
+        keep = own or env_id == info.get("env_id")
+        info.update(task=task, env_id=env_id, env_kwargs=info["env_kwargs"] if keep else {})
     if "env_id" not in info:
         raise ConfigError(f"{path} does not say what environment it was trained on; pass --env")
     return info
