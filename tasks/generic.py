@@ -168,7 +168,7 @@ class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any], terminate_on_success: bool = True, **given: Any) -> None:
         super().__init__(env)
-        description = describe_goal_env(env, **given)
+        description = _described(env, given)
         self.subgoals = description.subgoals
         self.achieved_in_observation = description.achieved_in_observation
         self.observation_scale = description.observation_scale
@@ -194,6 +194,19 @@ class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
         reward = float(reward) - self._best
         info["is_success"] = success = bool(info.get("is_success", info.get("success", reward >= -1e-9)))
         return observation, reward, bool(terminated or (self._terminate_on_success and success)), truncated, info
+
+
+_DESCRIPTIONS: dict[str, GoalEnvDescription] = {}
+"""Descriptions found so far; environments of one vector need the random episodes only once."""
+
+
+def _described(env: gym.Env[Any, Any], given: dict[str, Any]) -> GoalEnvDescription:
+    if env.spec is None:
+        return describe_goal_env(env, **given)
+    key = repr((env.spec.id, env.spec.kwargs, env.spec.max_episode_steps, given))
+    if key not in _DESCRIPTIONS:
+        _DESCRIPTIONS[key] = describe_goal_env(env, **given)
+    return _DESCRIPTIONS[key]
 
 
 # -- what describe_goal_env is made of ---------------------------------------------------------------------------------

@@ -164,6 +164,22 @@ def test_wrapper_brings_rewards_to_zero_and_minus_one():
     assert not DescribedGoalEnv(Paying(), terminate_on_success=False).compute_terminated(*goals, {}).any()
 
 
+def test_description_is_found_once_per_environment_and_arguments(monkeypatch):
+    from sb3_tbc.tasks import generic
+
+    calls = []
+    describe = generic.describe_goal_env
+    monkeypatch.setattr(
+        generic, "describe_goal_env", lambda env, **given: calls.append(given) or describe(env, **given)
+    )
+    for low in (-3, -3, -2):
+        DescribedGoalEnv(make("Pendulum"), n_probe_steps=5, low=[low, -9])
+    assert [given["low"] for given in calls] == [[-3, -9], [-2, -9]]
+    DescribedGoalEnv(Point(), n_probe_steps=5)
+    DescribedGoalEnv(Point(), n_probe_steps=5)
+    assert len(calls) == 4  # without a spec there is nothing to tell environments apart by
+
+
 def test_a_maze_of_gymnasium_robotics():
     import gymnasium_robotics
 
