@@ -34,7 +34,7 @@ class ReachPairs(NamedTuple):
     local: Float32  # (n, local_dim), what the low level saw
     here: Float32  # (n, subgoal_dim), where it was
     goal: Float32  # (n, subgoal_dim), where it was later
-    steps: Float32  # (n,), how many steps later
+    steps: Float32  # (n,), how many steps later it first was there
 
 
 class OptionReplayBuffer(RingBuffer):
@@ -172,6 +172,9 @@ class SubgoalReplayBuffer(RingBuffer):
     def sample_pairs(self, n: int, horizon: int, rng: np.random.Generator) -> ReachPairs:
         """Uniformly drawn steps, and a uniformly drawn one of the up to ``horizon`` points reached from there on.
 
+        The label is the step at which that point was first reached, within the subgoal's thresholds: on a way that
+        comes back to a point, the later visits say nothing of how far it is.
+
         :param rng: draws them, so that the sampling of transitions stays what it is without them
         """
         data = self.data
@@ -180,8 +183,10 @@ class SubgoalReplayBuffer(RingBuffer):
         written = self.buffer_size - (at - self.pos) % self.buffer_size if self.full else self.pos - at
         ahead = np.minimum(data["to_end"][at, 0].astype(np.int64), written)
         steps = rng.integers(0, np.minimum(ahead, horizon)) + 1
-        later = (at + steps - 1) % self.buffer_size
-        return ReachPairs(data["local"][at], data["here"][at], data["achieved"][later], steps.astype(np.float32))
+        goal = data["achieved"][(at + steps - 1) % self.buffer_size]
+        way = data["achieved"][(at[:, None] + np.arange(steps.max())) % self.buffer_size]
+        first = self.layout.subgoals.reached(way, goal[:, None]).argmax(axis=1) + 1  # the goal itself is on the way
+        return ReachPairs(data["local"][at], data["here"][at], goal, first.astype(np.float32))
 
     def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
         data = self.data

@@ -287,3 +287,31 @@ def test_config_of_a_run_builds_the_same_run(run: RunFolder) -> None:
 
     data = yaml.safe_load((run.path / "config.yml").read_text())
     assert RunSpec.from_dict(data).to_dict() == data
+
+
+@pytest.mark.parametrize("algo", ["hac", "sac"])
+def test_baselines_go_through_the_same_doors(algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    small = TINY if algo == "hac" else ["--hyperparams", "gradient_ratio:0.02", "batch_size:16", "buffer_size:1000"]
+    arguments = ["--algo", algo, "--env", "Drawbridge", "--log-folder", str(tmp_path), "--n-timesteps", "300"]
+    assert train.main([*arguments, "--keep-checkpoint", *SHORT, *small]) == 0
+    folder = RunFolder.of(tmp_path, "Drawbridge", algo, "full", 0)
+    final = folder.read_final()
+    assert final["algo"] == algo
+    assert (final["subgoal_success"] is None) == (algo == "sac")
+    out = tmp_path / "e.json"
+    assert (
+        evaluate.main([str(folder.model), "--n-episodes", "2", "--seed", str(final["eval_seed"]), "--json", str(out)])
+        == 0
+    )
+    assert {k: json.loads(out.read_text())[k] for k in PINNED} == {k: final[k] for k in PINNED}
+    assert train.main(["--resume", str(folder.path), "--n-timesteps", "500", "--no-progress"]) == 0
+    assert folder.read_final()["n_timesteps"] >= 500
+
+
+def test_ablations_print_their_parameters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["--ablation", "no-ndbc", "--n-timesteps", "200", "--log-folder", str(tmp_path)]
+    assert train.main([*arguments, *SHORT, *TINY]) == 0
+    assert "no-ndbc: " in capsys.readouterr().out
+    folder = RunFolder.of(tmp_path, "Pendulum", "tbc-hrl", "no-ndbc", 0)
+    assert folder.read_final()["variant"] == "no-ndbc"
+    assert folder.read_config()["model"]["low"]["policy_kwargs"]["ndbc"] is None

@@ -27,7 +27,8 @@ WINDOW_CAPS = {  # episode length / action budget, as in the public HiTS files
     "Tennis2D": 62.5,
     "UR5Reacher": 25.0,
 }
-COLUMN = {"tbc-hrl": "TBC-HRL", "hits": "HiTS"}
+COLUMN = {"tbc-hrl": "TBC-HRL", "hits": "HiTS", "hac": "HAC"}
+PEERS = yaml.safe_load((Path(__file__).parent / "data" / "peer_hyperparameters.yaml").read_text())
 
 
 def entropy(value: Any) -> Any:
@@ -42,7 +43,11 @@ def test_paper_configuration_is_table_a2(algo: str, task: str) -> None:
     run = load_config(algo, task, "paper")
     assert run.n_timesteps == TABLES["table_1_environments"][task]["training_steps"]
     assert run.model["max_options"] == row["max_actions"]
-    assert run.model["dt_max"] == row["dt_max"]
+    if algo == "hac":
+        assert run.model["dt_max"] == (27 if task == "AntFourRooms" else -1)
+    else:
+        assert run.model["dt_max"] == row["dt_max"]
+    assert run.model.get("kappa") == row.get("kappa")
     assert run.model["n_hindsight_goals"] == row["hindsight"]
     for level, alpha in zip(("low", "high"), row["alpha"], strict=True):
         settings = run.model[level]
@@ -51,6 +56,37 @@ def test_paper_configuration_is_table_a2(algo: str, task: str) -> None:
         assert settings["tau"] == float(row["polyak"])
         assert entropy(settings["ent_coef"]) == entropy(alpha)
         assert "n_hindsight_goals" not in settings
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_flat_paper_configuration_is_table_a2(task: str) -> None:
+    row = TABLES["table_a2_hyperparameters"]["SAC"][task]
+    run = load_config("sac", task, "paper")
+    assert run.n_timesteps == TABLES["table_1_environments"][task]["training_steps"]
+    model = run.model
+    assert (model["learning_rate"], model["batch_size"], model["tau"]) == (row["lr"], row["batch"], row["polyak"])
+    assert model["n_hindsight_goals"] == row["hindsight"]
+    assert entropy(model["ent_coef"]) == entropy(row["alpha"][0])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_peers_settings_where_the_paper_is_silent(task: str) -> None:
+    """Discounts, widths, update ratios, hindsight places, target entropies of the public files."""
+    for algo in ("hac", "sac"):
+        model, levels = load_config(algo, task, "paper").model, PEERS[task][algo]
+        assert model["gradient_ratio"] == levels[0]["grad_steps_per_env_step"]
+        assert algo == "sac" or model["learning_starts"] == levels[0]["learning_starts"]
+        for name, peer in zip(("low", "high") if algo == "hac" else ("flat",), levels, strict=True):
+            ours = model if algo == "sac" else {**model[name], **model[name]["policy_kwargs"]}
+            widths = ours["net_arch"] if algo == "hac" else model["policy_kwargs"]["net_arch"]
+            assert widths == peer["hidden_layers"]
+            assert ours["gamma"] == peer["gamma"]
+            if "target_entropy" in peer:
+                assert ours["target_entropy"] == peer["target_entropy"]
+            strategy = ours.get("goal_strategy", model["goal_strategy"])
+            assert strategy == peer["goal_sampling_strategy"] or peer["goal_sampling_strategy"] == "Tennis2DGSS"
+        if algo == "hac":
+            assert model["max_options"] == levels[1]["max_n_actions"]
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -155,7 +191,7 @@ def test_a_run_configuration_survives_yaml() -> None:
         RunConfig.from_dict({"algo": "x"})
 
 
-@pytest.mark.parametrize("algo", sorted(COLUMN))
+@pytest.mark.parametrize("algo", [*sorted(COLUMN), "sac"])
 def test_every_shipped_section_is_a_task(algo: str) -> None:
     assert set(read_file(config_file(algo))) == {"default", *TASKS}
 
@@ -164,7 +200,7 @@ def test_the_schema_is_what_the_agent_takes() -> None:
     taken = set(inspect.signature(TBCHRL).parameters)
     given_by_the_runner = {"env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size"}
     assert set(MODEL) == taken - given_by_the_runner - {"subgoals", "_init_setup_model"}
-    assert set(LEVEL) == {*LEVEL_DEFAULTS, "n_hindsight_goals"}
+    assert set(LEVEL) == {*LEVEL_DEFAULTS, "n_hindsight_goals", "goal_strategy"}
 
 
 @pytest.mark.parametrize("config", ["paper", "tuned"])
@@ -182,4 +218,18 @@ def test_every_shipped_section_builds(task: str, algo: str, config: str) -> None
     state_dim = model.low.policy.actor.state_dim
     assert state_dim == (0 if circuit is None else circuit["inter"] + circuit["command"] + circuit["motor"])
     assert model.rules.window_end == run.model["window_end"]
-    assert model.rules.dt_max == pytest.approx(WINDOW_CAPS[task], abs=1e-3)
+    cap = (
+        {"AntFourRooms": 27.0, "Pendulum": 37.037}.get(task, WINDOW_CAPS[task]) if algo == "hac" else WINDOW_CAPS[task]
+    )
+    assert model.rules.dt_max == pytest.approx(cap, abs=1e-3)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_flat_section_builds(task: str) -> None:
+    run = load_config("sac", task, None, parse_overrides(["buffer_size:1000"]))
+    env = make_envs(task_names()[task], 1, 0, run.env_kwargs)
+    try:
+        model = build_model(run, env, seed=0)
+    finally:
+        env.close()
+    assert model.gradient_steps == round(100 * run.model["gradient_ratio"])

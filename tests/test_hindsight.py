@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from corridor import Corridor
@@ -13,12 +15,14 @@ from sb3_tbc.hindsight import (
     HindsightSettings,
     goal_pairs,
     high_level_steps,
+    hindsight_success,
     low_level_steps,
     ordered_pairs,
     relabel_actions,
     relabel_goals,
 )
 from sb3_tbc.layout import LevelLayout
+from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import Episode, Option, OptionRules, TerminationReason
 
 ENV = Corridor()
@@ -123,8 +127,9 @@ def test_ordered_pairs_are_uniform() -> None:
     np.testing.assert_allclose(counts[[0, 1, 2, 4, 5, 8]] / 60_000, 1 / 6, atol=0.01)
 
 
-def low_buffer(size: int, hindsight: float, rules: OptionRules = RULES) -> SubgoalReplayBuffer:
-    return SubgoalReplayBuffer(size, LAYOUT.low_space(), ENV.action_space, LAYOUT, rules, 2, 0.99, hindsight, seed=0)
+def low_buffer(size: int, hindsight: float, rules: OptionRules = RULES, **kwargs: Any) -> SubgoalReplayBuffer:
+    spaces = LAYOUT.low_space(), ENV.action_space
+    return SubgoalReplayBuffer(size, *spaces, LAYOUT, rules, 2, 0.99, hindsight, seed=0, **kwargs)
 
 
 def test_relabelled_low_level_samples_are_consistent() -> None:
@@ -191,3 +196,130 @@ def test_buffer_state_round_trip_and_mismatch() -> None:
         other.set_state(state)
     with pytest.raises(ValueError, match="does not fit"):
         low_buffer(3, 1).extend(low_level_steps(episode(), ENV.subgoals, RULES))
+
+
+def test_dense_reward_adds_up_to_how_much_nearer_the_window_came() -> None:
+    steps = low_level_steps(episode(), ENV.subgoals, RULES, LowLevelReward("dense", ENV.subgoals, RULES))
+    # a step of 0.1 toward the subgoal is 0.05 of the bounds' width; the last one also reaches it in time
+    np.testing.assert_allclose(steps.rewards, [0.05, 0.05, 0.05, 0.05, 1.05], atol=1e-6)
+    np.testing.assert_array_equal(steps.dones, [False, False, True, False, True])
+    reward = LowLevelReward("dense", ENV.subgoals, RULES)
+    np.testing.assert_allclose(reward.completion(np.array([[1.0], [-1.0], [0.5]]), np.ones((3, 1))), [1, 0, 0.75])
+    with pytest.raises(ValueError, match="low_reward must be one of 'sparse', 'dense', 'step', got 'dence'"):
+        LowLevelReward("dence", ENV.subgoals, RULES)
+
+
+def test_per_step_reward_ends_where_the_subgoal_is_reached_and_only_there() -> None:
+    steps = low_level_steps(episode(), ENV.subgoals, RULES, LowLevelReward("step", ENV.subgoals, RULES))
+    np.testing.assert_array_equal(steps.rewards, [-1, -1, -1, -1, 0])
+    np.testing.assert_array_equal(steps.dones, [False, False, False, False, True])  # running out of time is no end
+
+
+def test_dense_reward_of_relabelled_steps() -> None:
+    buffer = low_buffer(100, 1e9, reward=LowLevelReward("dense", ENV.subgoals, RULES))
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    batch = buffer.sample_burst(1, 500)
+    ahead = np.rint((batch.observations[0, :, 3] - batch.observations[0, :, 0]).numpy() / 0.1)
+    np.testing.assert_allclose(batch.rewards[0, :, 0].numpy(), 0.05 + (ahead == 1), atol=1e-6)
+
+
+@pytest.mark.parametrize("strategy", ["future", "episode"])
+def test_untimed_goals_come_from_the_same_window(strategy: str) -> None:
+    layout = LAYOUT._replace(remaining_time=False, timed_actions=False)
+    reward = LowLevelReward("step", ENV.subgoals, RULES)
+    buffer = SubgoalReplayBuffer(
+        100, layout.low_space(), ENV.action_space, layout, RULES, 2, 0.99, 3, seed=0, reward=reward, hindsight=strategy
+    )
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES, reward))
+    batch = buffer.sample_burst(1, 20_000)
+    assert batch.observations.shape == (1, 20_000, 4)  # position, steps, serial, subgoal: no time
+    row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
+    goal = batch.observations[0, :, 3].numpy().round(1)
+    drawn = {r: sorted(set(goal[row == r].tolist())) for r in range(5)}
+    if strategy == "future":  # strictly later, so the last step of a window keeps its subgoal
+        assert drawn[0] == pytest.approx([0.2, 0.3, 0.9])
+        assert drawn[1] == pytest.approx([0.3, 0.9])
+        assert drawn[2] == pytest.approx([0.9])
+        # two goals are there to draw from at the first step, one at the second
+        assert np.mean(goal[row == 0] < 0.5) == pytest.approx(2 / 3, abs=0.03)
+        assert np.mean(goal[row == 1] < 0.5) == pytest.approx(1 / 2, abs=0.03)
+    else:
+        assert drawn[0] == drawn[1] == drawn[2] == pytest.approx([0.1, 0.2, 0.3, 0.9])
+        assert np.mean(goal[row == 2] < 0.5) == pytest.approx(3 / 4, abs=0.03)
+    met = np.abs(goal - 0.1 * (row + 1)) < 0.05
+    np.testing.assert_array_equal(batch.rewards[0, :, 0].numpy(), met - 1.0)
+    np.testing.assert_array_equal(batch.dones[0, :, 0].numpy(), met)
+    with pytest.raises(ValueError, match="hindsight must be one of timed, future, episode"):
+        SubgoalReplayBuffer(9, LAYOUT.low_space(), ENV.action_space, LAYOUT, RULES, 2, 0.9, 1, hindsight="final")
+
+
+@pytest.mark.parametrize(("end", "relabelled"), [(1.04, True), (1.2, False)])
+def test_hindsight_options_must_end_within_the_tolerance(end: float, relabelled: bool) -> None:
+    """The nearest subgoal to a point outside of the bounds is the bound: 1.04 is 0.04 away in unit coordinates."""
+    moved = episode()
+    moved.achieved_goal[3] = end
+    actions, changed = relabel_actions(moved, ENV.subgoals, RULES, np.random.default_rng(0), tolerance=0.05)
+    np.testing.assert_array_equal(changed, [relabelled, False])
+    assert actions[0, 0] == pytest.approx(1.0 if relabelled else 0.9)
+    reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0)
+    settings = HindsightSettings(0, "future", -5.0, keep_original=False, tolerance=0.05)
+    steps = high_level_steps(moved, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
+    # the failed test is penalised; without a hindsight action it is not also stored as if nothing had been wrong
+    assert steps.rewards.tolist() == ([-5.0, -1.0, 0.0] if relabelled else [-5.0, 0.0])
+
+
+def test_hindsight_success_is_a_distance_in_unit_coordinates() -> None:
+    reached = np.array([[0.03, 0.04], [0.03, 0.041], [0.0, 0.0]])
+    np.testing.assert_array_equal(hindsight_success(reached, np.zeros((3, 2))), [True, False, True])
+
+
+def test_originals_are_kept_beside_their_hindsight_copies() -> None:
+    options = (option(0, 3, 0.9, 2.5, False, False), option(3, 2, 0.5, 1.5, False, True))
+    reward = HighLevelReward(
+        "decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0, completion_bonus=0.25
+    )
+    settings = HindsightSettings(0, "future", -5.0, keep_original=True)
+    steps = high_level_steps(
+        episode()._replace(options=options), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high,
+        np.random.default_rng(0),
+    )  # fmt: skip
+    np.testing.assert_allclose(steps.actions[:, 0], [0.9, 0.3, 0.5])  # as chosen, as it turned out, as it was reached
+    np.testing.assert_allclose(steps.rewards, [-1.0, -1.0 + 0.25, 0.0 + 0.25])  # only what was completed has the bonus
+    np.testing.assert_array_equal(steps.relabelled, [False, True, False])
+    np.testing.assert_allclose(steps.here[:, 0], [0.0, 0.0, 0.3])  # where each option began
+
+
+def test_burn_in_recomputes_memory_through_the_window() -> None:
+    buffer = low_buffer(100, hindsight=0, sequence_length=3)
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    buffer.advance = lambda observations, states: 0.5 * states + observations[:, :1]
+    batch = buffer.sample_burst(1, 200)
+    row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
+    # state before row 2: 0.5 * (0.5 * 0 + position of row 0) + position of row 1; memory begins anew at row 3
+    before, after = np.array([0, 0, 0.1, 0, 0.3]), np.array([0, 0.1, 0.25, 0.3, 0.55])
+    np.testing.assert_allclose(batch.states[0, :, 0].numpy(), before[row], atol=1e-6)
+    np.testing.assert_allclose(batch.next_states[0, :, 1].numpy(), after[row], atol=1e-6)
+
+
+def test_burn_in_starts_from_the_stored_state_where_it_is_shorter_than_the_window() -> None:
+    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    buffer = low_buffer(100, hindsight=0, sequence_length=2)
+    buffer.extend(steps._replace(states=np.arange(5.0)[:, None] * np.ones((5, 2))))
+    buffer.advance = lambda observations, states: states + 10.0
+    batch = buffer.sample_burst(1, 200)
+    row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
+    np.testing.assert_allclose(batch.states[0, :, 0].numpy(), np.array([0, 10, 11, 3, 13])[row])
+
+
+def test_burn_in_sees_the_sampled_subgoal_and_its_time() -> None:
+    buffer = low_buffer(100, hindsight=1e9, sequence_length=2)
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    buffer.advance = lambda observations, states: observations[:, 3:5]
+    batch = buffer.sample_burst(1, 500)
+    observations, states = batch.observations[0].numpy(), batch.states[0].numpy()
+    later = ~np.isin(np.rint(observations[:, 0] / 0.1), [0, 3])  # not the first step of a window
+    np.testing.assert_allclose(states[later, 0], observations[later, 3])
+    np.testing.assert_allclose(states[later, 1], np.minimum(observations[later, 4] + 0.25, 1.0), atol=1e-6)
+    assert (states[~later] == 0).all()
+    with pytest.raises(ValueError, match="recomputes the low level's memory"):
+        SubgoalReplayBuffer(9, LAYOUT.low_space(), ENV.action_space, LAYOUT, RULES, 0, 0.9, 1, sequence_length=2)

@@ -281,3 +281,62 @@ def test_compiled_circuit_agrees_with_eager() -> None:
     assert len(levels[1]._update._steps) == 1
     for name, value in eager.items():
         assert th.allclose(compiled[name], value, rtol=0, atol=1e-5), name
+
+
+class LabelledBuffer(FixedBuffer):
+    """The same batches with a label each."""
+
+    def __init__(self, batches: LevelBatch, label: float) -> None:
+        super().__init__(batches)
+        self.label = label
+
+    def sample_labelled(self, gradient_steps: int, batch_size: int) -> tuple[LevelBatch, th.Tensor]:
+        return self.sample_burst(gradient_steps, batch_size), th.full((gradient_steps, batch_size, 1), self.label)
+
+
+def labelled_level(label: float, coef: float, compile: bool = False) -> SACLevel:
+    level = make_level(make_batches(), compile, label_coef=coef, ent_coef=0.01)
+    level.attach(LabelledBuffer(make_batches(), label))
+    return level
+
+
+def test_label_loss_is_added_to_the_actors_loss() -> None:
+    """One update: with Adam's first moment 0.1 times the gradient, its difference is the label loss's gradient."""
+    moments, levels = [], []
+    for coef in (1e-9, 2.0):
+        level = labelled_level(0.4, coef)
+        start = level._update.actor.vector.detach().clone().requires_grad_()
+        level.train(1, BATCH)
+        moments.append(level.actor.optimizer.state[level._update.actor.vector]["exp_avg"] / 0.1)
+        levels.append(level)
+    batch, noise = make_batches(), level_noise(levels[0], 1)
+    mean, log_std, _ = level.policy.actor.step_blocks(
+        level._update.actor.unflatten(start), [], batch.observations[0], batch.states[0]
+    )
+    actions, _ = squash(mean, log_std, noise[0, 0])
+    (expected,) = th.autograd.grad(2.0 * (actions[:, -1] - 0.4).square().mean(), start)
+    assert th.allclose(moments[1] - moments[0], expected, atol=1e-5)
+    losses = [level.logger.name_to_value["level/actor_loss"] for level in levels]
+    added = 2.0 * float((actions[:, -1] - 0.4).square().mean().detach())
+    assert losses[1] - losses[0] == pytest.approx(added, abs=1e-4)
+
+
+def test_labels_where_they_are_needed_and_only_there() -> None:
+    level = labelled_level(0.4, 1.0)
+    batch, noise = level.replay_buffer.sample_burst(1, BATCH), level_noise(level, 1)
+    arguments = {"tau": 0.01, "target_entropy": -2.0, "ent_coef": level._ent_coef_state()}
+    with pytest.raises(ValueError, match="labels are needed where label_coef is not 0"):
+        level._update.run(batch, noise, **arguments)
+    with pytest.raises(ValueError, match=r"batch\.labels must be float32 of shape"):
+        level._update.run(batch, noise, labels=th.zeros(1, BATCH, 2), **arguments)
+
+
+@pytest.mark.slow
+@COMPILER
+def test_compiled_label_loss_agrees_with_eager() -> None:
+    eager, compiled = (labelled_level(-0.3, 1.5, compile) for compile in (False, True))
+    for level in (eager, compiled):
+        level.train(UPDATES, BATCH)
+    assert compiled.compiled
+    for name, value in eager.policy.state_dict().items():
+        assert th.allclose(compiled.policy.state_dict()[name], value, rtol=0, atol=1e-5), name

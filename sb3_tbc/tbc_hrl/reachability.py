@@ -21,8 +21,8 @@ BATCH_SIZE = 256
 class Reachability(nn.Module):
     """Estimates ``H_reach(s, g)``, the steps from a state to a subgoal-space point, from what was visited when.
 
-    Hindsight gives exact labels: the steps between a visited state and a point visited later in the same episode. Most
-    of them are detours, so a low expectile is regressed: it leans toward the short ways, i.e. the geodesic.
+    Hindsight gives exact labels: the steps from a visited state to the first visit of a point of the same episode.
+    Many of these ways are detours, so a low expectile is regressed: it leans toward the short ones, i.e. the geodesic.
 
     :param subgoals: bounds and scales of what goes in
     :param unit: a typical number of steps, the output's scale

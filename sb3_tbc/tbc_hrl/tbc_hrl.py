@@ -229,7 +229,7 @@ class TBCHRL(BaseAlgorithm):
             steps = self.rules.dt_max if self.fixed_duration is None else self.fixed_duration
             self.schedule = FixedWindows(self.rules, steps)
         elif self.duration == "rule" or self.duration_loss_coef:
-            horizon = math.ceil(2.0 * self.rules.dt_max)
+            horizon = math.ceil(self.rules.dt_max / max(self.kappa, 0.1))  # what is further away is clipped anyway
             self.reachability = Reachability(subgoals, self.rules.dt_ref, horizon, seed=seed)
             self.rule = ReachRule(self.layout, self.rules, self.reachability, self.kappa)
             self.schedule = self.rule if self.duration == "rule" else None

@@ -1,0 +1,50 @@
+"""Ablations leave out what they name, and nothing else: their number of parameters is the full model's."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.zoo.ablations import match_parameters, mlp_parameters, parameter_count
+from sb3_tbc.zoo.algorithms import build_model
+from sb3_tbc.zoo.config import ABLATIONS, load_config
+from sb3_tbc.zoo.environments import make_envs, task_names
+
+
+def test_mlp_parameters() -> None:
+    assert mlp_parameters([3, 4, 2]) == 3 * 4 + 4 + 4 * 2 + 2
+    assert mlp_parameters([3]) == 0
+
+
+@pytest.mark.parametrize("ablation", sorted(ABLATIONS))
+@pytest.mark.parametrize("task", sorted(task_names()))
+def test_parameters_match_within_half_a_percent(task: str, ablation: str) -> None:
+    env_id = task_names()[task]
+    full = load_config("tbc-hrl", task)
+    matched = match_parameters(load_config("tbc-hrl", task, ablation=ablation), full, env_id)
+    print(f"{task} {ablation}: {matched}")
+    env = make_envs(env_id, 1, 0, full.env_kwargs)
+    model = build_model(matched.run, env, seed=0)
+    env.close()
+    assert matched.ablated == parameter_count(model)
+    assert abs(matched.ablated / matched.full - 1) <= 0.005
+    assert matched.run.n_timesteps == full.n_timesteps
+    for key in ("batch_size", "learning_rate", "gamma", "tau", "ent_coef"):
+        assert matched.run.model["low"][key] == full.model["low"][key]
+    if ablation == "no-ndbc":
+        assert model.low.state_dim == 0
+        assert model.layout.remaining_time
+    else:
+        assert model.low.state_dim > 0
+        assert not model.layout.remaining_time
+        assert not model.layout.timed_actions
+        durations = np.array([1, 20])
+        assert len(set(model.high_reward.discounts(durations))) == 1  # no gamma ** tau
+
+
+def test_ablations_are_of_the_full_method() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'no-ndbc'"):
+        load_config("tbc-hrl", "Pendulum", ablation="no-ndcb")
+    with pytest.raises(ConfigError, match="ablations are of tbc-hrl"):
+        load_config("hits", "Pendulum", ablation="no-ts")
