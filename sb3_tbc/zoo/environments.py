@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -13,6 +14,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_tbc  # noqa: F401  (registers the tasks)
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.tasks.generic import DescribedGoalEnv
 from sb3_tbc.zoo.schema import nearest
 
 NAMESPACE = "sb3_tbc/"
@@ -60,7 +62,7 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[st
     :raises ConfigError: if it cannot be made, is no goal environment, or its actions are not a Box
     """
     try:
-        env = make_vec_env(env_id, n_envs, seed=seed, env_kwargs=dict(env_kwargs or {}))
+        env = make_vec_env(partial(_make, env_id), n_envs, seed=seed, env_kwargs=dict(env_kwargs or {}))
     except (gym.error.Error, ImportError, TypeError, ValueError) as error:
         raise ConfigError(f"cannot make environment {env_id!r} with {dict(env_kwargs or {})}: {error}") from error
     try:
@@ -69,6 +71,17 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[st
         env.close()
         raise
     return env
+
+
+def _make(env_id: str, **env_kwargs: Any) -> gym.Env[Any, Any]:
+    """Make one environment; a goal environment that does not say what to ask for gets a derived subgoal space."""
+    try:
+        env = gym.make(env_id, **{"render_mode": "rgb_array", **env_kwargs})
+    except TypeError:
+        env = gym.make(env_id, **env_kwargs)
+    keys = env.observation_space.spaces if isinstance(env.observation_space, spaces.Dict) else {}
+    is_goal_env = all(key in keys for key in GOAL_KEYS) and isinstance(env.action_space, spaces.Box)
+    return env if not is_goal_env or hasattr(env.unwrapped, "subgoals") else DescribedGoalEnv(env)
 
 
 def check_goal_env(env: VecEnv, env_id: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 from dataclasses import asdict, dataclass, replace
@@ -97,7 +98,7 @@ class RunOptions:
     :param verbose: print a line per evaluation
     :param tensorboard: write TensorBoard files into the run folder
     :param trace: write ``options.csv``
-    :param checkpoint_seconds: time between checkpoints
+    :param checkpoint_seconds: time between checkpoints; infinite for none, not even when stopped
     :param keep_checkpoint: keep the last checkpoint (with replay buffers) of a finished run
     """
 
@@ -222,7 +223,8 @@ def _learn(
         try:
             _train(model, spec.run.n_timesteps, CallbackList(callbacks), options.progress)
         except KeyboardInterrupt as error:
-            checkpoint()
+            if math.isfinite(options.checkpoint_seconds):
+                checkpoint()
             message = f"stopped at {model.num_timesteps} of {spec.run.n_timesteps} steps"
             raise Interrupted(message, folder.path) from error
         save_atomic(model.save, folder.model)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import shutil
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -112,7 +111,6 @@ class TrialRunner:
             trial.set_user_attr(REASON, str(pruned))
             raise
         except Interrupted as stopped:
-            shutil.rmtree(stopped.folder / "checkpoint", ignore_errors=True)
             raise Stopped(str(stopped)) from stopped
 
     def _claim(self, trial: Trial) -> None:

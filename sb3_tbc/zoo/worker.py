@@ -223,6 +223,10 @@ def _main(job: Job, index: int) -> None:
 
 def _interrupt_once(number: int, frame: FrameType | None) -> None:
     """A terminal sends Ctrl-C to every process and the parent passes on a stop: only the first may interrupt."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, _stopping)
+    signal.signal(signal.SIGINT, _stopping)
     raise KeyboardInterrupt
+
+
+def _stopping(number: int, frame: FrameType | None) -> None:
+    """The worker is putting its trial back already."""
