@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
@@ -36,19 +37,20 @@ class GLUnavailable(RuntimeError):
     """No way to draw with OpenGL; the message says what to install."""
 
 
-def _open_context(width: int, height: int) -> Any:
+def _open_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
     """The first OpenGL context that works: the one named by MUJOCO_GL, or EGL, OSMesa, GLFW in this order."""
     named = os.environ.get("MUJOCO_GL", "").lower().strip()
     kinds = [named] if named in ("egl", "osmesa", "glfw", "cgl") else ["egl", "osmesa", "glfw"]
     failures = []
     for kind in kinds:
         try:
-            context = import_module(f"mujoco.{kind}").GLContext(width, height)
-            context.make_current()
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # GLFW says by warnings that there is no display
+                context = import_module(f"mujoco.{kind}").GLContext(width, height)
+                context.make_current()
+            return context, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # Each backend fails with errors of its own library.
             failures.append(f"{kind}: {type(error).__name__}: {error}".splitlines()[0])
-        else:
-            return context
     raise GLUnavailable(
         "Drawing this task needs OpenGL, and no backend works here. Install one, e.g. `apt-get install libegl1 "
         "libgl1-mesa-dri` (EGL) or `apt-get install libosmesa6` (software, with MUJOCO_GL=osmesa set before Python "
@@ -79,8 +81,7 @@ class Scene:
     ) -> None:
         self._model, (width, height) = model, size
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        self._gl = _open_context(width, height)
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
+        self._gl, self._context = _open_context(model, width, height)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self.scene = mujoco.MjvScene(model, maxgeom=400)
