@@ -40,6 +40,9 @@ from sb3_tbc.zoo.trial import Stopped, Surplus, TrialRunner
 POLL = 1.0
 """Seconds between looks at the storage while the last trials run elsewhere."""
 
+STOP_SECONDS = 60.0
+"""How long a stopped worker may take to put its trial back."""
+
 
 @dataclass(frozen=True)
 class Job:
@@ -196,11 +199,17 @@ def _watch(workers: Sequence[BaseProcess]) -> None:
 
 
 def _stop(workers: Sequence[BaseProcess]) -> None:
+    """Let every worker put its trial back; an impatient second Ctrl-C must not leave them behind."""
+    before = {number: signal.signal(number, _stopping) for number in (signal.SIGINT, signal.SIGTERM)}
     for worker in workers:
         if worker.is_alive():
             worker.terminate()
     for worker in workers:
-        worker.join(60)
+        worker.join(STOP_SECONDS)
+        if worker.is_alive():
+            worker.kill()  # its trial is run again for want of signs of life
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 def _main(job: Job, index: int) -> None:
@@ -229,4 +238,4 @@ def _interrupt_once(number: int, frame: FrameType | None) -> None:
 
 
 def _stopping(number: int, frame: FrameType | None) -> None:
-    """The worker is putting its trial back already."""
+    """Stopping has begun already."""
