@@ -69,7 +69,7 @@ def steps(callback: Any, agent: Agent, until: int, by: int = 1) -> None:
 
 def test_evaluates_on_time_and_keeps_the_best(agent: Agent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds: list[int] = []
-    monkeypatch.setattr(callbacks, "evaluate_hierarchical", evaluation([0.5, 1.0, 0.5, 1.0], seeds))
+    monkeypatch.setattr(callbacks, "evaluate_agent", evaluation([0.5, 1.0, 0.5, 1.0], seeds))
     csv_path, best = tmp_path / "e.csv", tmp_path / "best.zip"
     callback = SuccessEvalCallback(None, 10, 4, seed=7, csv_path=csv_path, best_model_path=best)  # type: ignore[arg-type]
     callback.init_callback(agent)  # type: ignore[arg-type]
@@ -84,7 +84,7 @@ def test_evaluates_on_time_and_keeps_the_best(agent: Agent, tmp_path: Path, monk
 
     # a resumed run continues the file and does not take a worse agent for the best
     seeds.clear()
-    monkeypatch.setattr(callbacks, "evaluate_hierarchical", evaluation([0.75], seeds))
+    monkeypatch.setattr(callbacks, "evaluate_agent", evaluation([0.75], seeds))
     again = SuccessEvalCallback(None, 10, 4, seed=7, csv_path=csv_path, best_model_path=best)  # type: ignore[arg-type]
     again.init_callback(agent)  # type: ignore[arg-type]
     steps(again, agent, 51)
@@ -103,7 +103,7 @@ def test_refuses_other_agents_and_silly_numbers() -> None:
         SuccessEvalCallback(None, eval_freq=0)  # type: ignore[arg-type]
     callback = SuccessEvalCallback(None, eval_freq=1)  # type: ignore[arg-type]
     callback.init_callback(Agent())  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="two-level agents, got Agent"):
+    with pytest.raises(TypeError, match="this package.s agents, got Agent"):
         callback.evaluate()
 
 
@@ -112,7 +112,7 @@ def test_inner_callback_can_stop_training(agent: Agent, monkeypatch: pytest.Monk
         def _on_step(self) -> bool:
             return False
 
-    monkeypatch.setattr(callbacks, "evaluate_hierarchical", evaluation([0.5], []))
+    monkeypatch.setattr(callbacks, "evaluate_agent", evaluation([0.5], []))
     callback = SuccessEvalCallback(None, 1, 4, callback_after_eval=Stop())  # type: ignore[arg-type]
     callback.init_callback(agent)  # type: ignore[arg-type]
     agent.num_timesteps = 1
