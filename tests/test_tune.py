@@ -25,7 +25,14 @@ from sb3_tbc.zoo.study import ORIGIN, REASON, open_storage, read_settings
 from sb3_tbc.zoo.study_report import difference, find_trial, importances, write_plots
 
 ENV = "tuned_corridor:TunedCorridor-v0"
-TINY = ["--hyperparams", "compile:false", "gradient_ratio:0.05", "low.buffer_size:2000", "high.buffer_size:500"]
+TINY = [
+    "--hyperparams",
+    "compile:false",
+    "gradient_ratio:0.05",
+    "low.batch_size:16",
+    "low.buffer_size:2000",
+    "high.buffer_size:500",
+]
 SHORT = ["--n-timesteps", "200", "--eval-freq", "100", "--n-eval-episodes", "2", "--n-final-episodes", "2"]
 NAME = "tbc-hrl-TunedCorridor-v0"
 
@@ -198,7 +205,7 @@ def quick(monkeypatch: pytest.MonkeyPatch, outcome: Any) -> list[int]:
 
 def test_a_run_that_is_not_finite_is_pruned_with_its_reason(tmp_path: Path) -> None:
     space = tmp_path / "space.yml"
-    space.write_text("default: {low.learning_rate: {low: 1.0e+30, high: 2.0e+30}}\n")
+    space.write_text("default: {low.learning_rate: {low: 1.0e+37, high: 2.0e+37}}\n")
     more = ["--n-trials", "2", "--search", "low.learning_rate", "--search-space", str(space)]
     assert tune.main(arguments(tmp_path, *more, *SHORT, *TINY)) == 0
     study = load(tmp_path)
