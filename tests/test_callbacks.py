@@ -103,7 +103,7 @@ def test_refuses_other_agents_and_silly_numbers() -> None:
         SuccessEvalCallback(None, eval_freq=0)  # type: ignore[arg-type]
     callback = SuccessEvalCallback(None, eval_freq=1)  # type: ignore[arg-type]
     callback.init_callback(Agent())  # type: ignore[arg-type]
-    with pytest.raises(TypeError, match="this package.s agents, got Agent"):
+    with pytest.raises(TypeError, match=r"this package's agents, got Agent"):
         callback.evaluate()
 
 

@@ -79,7 +79,7 @@ def test_pairs_are_steps_apart_and_never_leave_the_episode() -> None:
     pairs = buffer.sample_pairs(5000, 40, np.random.default_rng(0))
     assert pairs.steps.min() == 1
     assert 20 < pairs.steps.max() <= 40
-    assert (np.abs(pairs.goal - pairs.here)[:, 0] <= 0.1 * pairs.steps + 0.05).all()  # the speed limit, and the threshold
+    assert (np.abs(pairs.goal - pairs.here)[:, 0] <= 0.1 * pairs.steps + 0.05).all()  # speed limit, threshold
 
 
 def test_a_point_passed_twice_is_as_far_as_the_first_time() -> None:

@@ -10,17 +10,20 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 LEVEL_DEFAULTS: dict[str, Any] = {
-    "learning_rate": 1e-3,
+    "learning_rate": 2e-3,
     "ent_coef_learning_rate": None,
     "batch_size": 256,
-    "gamma": 0.98,
-    "tau": 0.01,
+    "gamma": 0.99,
+    "tau": 0.0125,
     "ent_coef": "auto",
     "target_entropy": "auto",
     "buffer_size": 1_000_000,
     "policy_kwargs": {"net_arch": [64, 64], "mean_bound": 3.0, "log_std_bounds": [-6.9, 1.8]},
 }
 """What a level uses where the user says nothing; the head's bounds are HiTS's (sigma in [1e-3, 6])."""
+
+HIGH_DEFAULTS: dict[str, Any] = {"learning_rate": 3e-3, "ent_coef": 1.0}
+"""Where the high level departs from them: a fixed temperature of the size of a decision's price keeps it exploring."""
 
 CHOICES = {"memory": ("window", "episode", "none"), "duration": ("joint", "rule", "fixed")}
 
@@ -71,7 +74,8 @@ def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str,
     kwargs = {**LEVEL_DEFAULTS["policy_kwargs"], **given.get("policy_kwargs", {})}
     if name == "high":
         kwargs.setdefault("negative_critic", True)
-    return {**LEVEL_DEFAULTS, **given, "policy_kwargs": kwargs}
+    role = HIGH_DEFAULTS if name == "high" else {}
+    return {**LEVEL_DEFAULTS, **role, **given, "policy_kwargs": kwargs}
 
 
 def check_settings(given: Mapping[str, Any]) -> None:
