@@ -21,13 +21,13 @@ from sb3_tbc.zoo.study import COUNTED, ORIGIN, WORKER, count_done, open_storage
 HERE = Path(__file__).parent
 NAME = "tbc-hrl-TunedCorridor-v0"
 GRACE = 8
-N_TRIALS = 4
+N_TRIALS = 3
 
 
 def command(folder: Path, storage: str, *more: str) -> list[str]:
-    tiny = ["compile:false", "gradient_ratio:0.02", "low.buffer_size:2000", "high.buffer_size:500", "n_timesteps:400"]
+    tiny = ["compile:false", "gradient_ratio:0.02", "low.buffer_size:2000", "high.buffer_size:500", "n_timesteps:200"]
     fixed = ["--env", "tuned_corridor:TunedCorridor-v0", "--log-folder", str(folder), "--storage", storage]
-    short = ["--eval-freq", "200", "--n-eval-episodes", "1", "--n-final-episodes", "1", "--pruner", "none"]
+    short = ["--eval-freq", "100", "--n-eval-episodes", "1", "--n-final-episodes", "1", "--pruner", "none"]
     size = ["--n-trials", str(N_TRIALS), "--grace-seconds", str(GRACE)]
     return [sys.executable, "-m", "sb3_tbc.tune", *fixed, *short, *size, "--hyperparams", *tiny, *more]
 

@@ -43,7 +43,7 @@ def resolve_env(name: str) -> tuple[str, str]:
             raise ConfigError(f"cannot import module {module!r} of environment {name!r}: {error}") from error
     if env_id in gym.registry:
         short = {i: task for task, i in tasks.items()}
-        return short.get(env_id, env_id), env_id
+        return short.get(env_id, env_id), name  # with its module, so that a saved agent finds its environment again
     raise ConfigError(f"unknown environment {name!r}; {nearest(name, _known(name, tasks))}")
 
 
