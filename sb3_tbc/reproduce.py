@@ -14,7 +14,7 @@ from pathlib import Path
 from sb3_tbc.cli import INTERRUPTED, Parser, positive_int, run_command
 from sb3_tbc.train import variant_name
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
-from sb3_tbc.zoo.config import CONFIGS, load_config, parse_overrides
+from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env, task_names
 from sb3_tbc.zoo.ledger import RunFolder
 
@@ -53,6 +53,7 @@ def build_parser() -> Parser:
     parser.add_argument("--workers", type=positive_int, default=1, help="runs at the same time, one thread each")
     parser.add_argument("--executor", choices=["local"], default="local")
     parser.add_argument("--config", choices=CONFIGS)
+    parser.add_argument("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
     parser.add_argument("--variant", help="name of the runs' folder; by default from the configuration")
     parser.add_argument("--n-timesteps", type=positive_int)
     parser.add_argument("--eval-freq", type=positive_int)
@@ -76,12 +77,13 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
             task, _ = resolve_env(name)
             for algo in args.algos:
                 algorithm(algo)
-                load_config(algo, task, args.config, overrides)  # so that mistakes are told before anything runs
-                variant = args.variant or variant_name(None, args.config)
+                load_config(algo, task, args.config, overrides, args.ablation)  # mistakes are told before anything runs
+                variant = args.variant or variant_name(args.ablation, args.config)
                 arguments = ["--algo", algo, "--env", name, "--seed", str(seed), "--variant", variant]
                 arguments += ["--log-folder", str(args.log_folder), "--n-final-episodes", str(args.n_final_episodes)]
                 for flag, value in (("--config", args.config), ("--n-timesteps", args.n_timesteps)):
                     arguments += [flag, str(value)] if value else []
+                arguments += ["--ablation", args.ablation] if args.ablation else []
                 arguments += ["--eval-freq", str(args.eval_freq)] if args.eval_freq else []
                 arguments += ["--hyperparams", *args.hyperparams] if args.hyperparams else []
                 folder, target = (RunFolder.of(r, task, algo, variant, seed) for r in (args.log_folder, args.ledger))

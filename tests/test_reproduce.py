@@ -29,6 +29,12 @@ def test_every_first_seed_comes_before_any_second(tmp_path: Path) -> None:
     assert order == [(0, "hits"), (0, "tbc-hrl"), (1, "hits"), (1, "tbc-hrl")]
 
 
+def test_ablations_have_folders_of_their_own(tmp_path: Path) -> None:
+    job = next(iter(reproduce.jobs(campaign(tmp_path, "--algos", "tbc-hrl", "--ablation", "no-ts"))))
+    assert job.target.path.parent.name == "no-ts"
+    assert "--ablation no-ts" in " ".join(job.command())
+
+
 def test_finished_runs_are_not_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     done = RunFolder.of(tmp_path / "results", "Pendulum", "hits", "full", 0)
     done.path.mkdir(parents=True)
