@@ -102,7 +102,7 @@ def _circuit(c: Circuit) -> str:
 
 
 _CHOSEN = """TBC_DT_MIN
-        + 0.5 * ((double)squash(unit[TBC_SUBGOAL], TBC_HIGH_BOUND) + 1.0) * (TBC_DT_MAX - TBC_DT_MIN)"""
+        + 0.5 * ((double)(float)squash(unit[TBC_SUBGOAL], TBC_HIGH_BOUND) + 1.0) * (TBC_DT_MAX - TBC_DT_MIN)"""
 _REMAINING = """
     seen[TBC_LOW_INPUT - 1] = (float)fmax(0.0, fmin((state->time_budget - state->elapsed) / TBC_DT_MAX, 1.0));"""
 _LOW_MLP = """
@@ -138,25 +138,29 @@ def _mlp(name: str, mlp: MLP) -> str:
     return f"{text}\n{dense}\nstatic void {name}_network(const float *x, float *y)\n{{\n{declared}{called}}}\n"
 
 
-_RULES = {"linear": "sum", "relu": "sum > 0.0f ? sum : 0.0f", "tanh": "tanhf(sum)"}
+_RULES = {"linear": "sum", "relu": "(sum > 0 ? sum : 0)", "tanh": "TBC_TANH(sum)"}
 _DENSE = """
 static void @NAME@_dense_@KIND@(int inputs, int outputs, const float *w, const float *b, const float *x, float *y)
 {
     int i, j;
     for (j = 0; j < outputs; ++j) {
-        float sum = b[j];
+        tbc_real sum = b[j];
         for (i = 0; i < inputs; ++i) {
             sum += w[j * inputs + i] * x[i];
         }
-        y[j] = @RULE@;
+        y[j] = (float)@RULE@;
     }
 }
 """
 
 
+def _doubles(name: str, values: FloatArray) -> str:
+    return f"static const double {name}[{len(values)}] = {{{', '.join(repr(float(v)) for v in values)}}};\n"
+
+
 def _option_data(policy: ExportedPolicy) -> str:
     text = _indices("local_entry", np.array(policy.local))
-    text += array("subgoal_low", policy.subgoal_low) + array("subgoal_high", policy.subgoal_high)
+    text += _doubles("subgoal_low", policy.subgoal_low) + _doubles("subgoal_high", policy.subgoal_high)
     text += array("action_low", policy.action_low) + array("action_high", policy.action_high)
     bounds = [b if np.isfinite(b) else np.finfo(np.float32).max for b in policy.mean_bounds]
     text += (

@@ -225,7 +225,7 @@ def cortex_m4(path: Path) -> Cortex | None:
         source, target = folder / "policy.c", folder / "policy.o"
         source.write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
         run = [compiler, *CORTEX_M4, "-ffunction-sections", "-fdata-sections"]
-        flags = ["-DTBC_LOW_LEVEL_ONLY", "-fstack-usage", "-c", str(source), "-o", str(target)]
+        flags = ["-DTBC_SINGLE", "-DTBC_LOW_LEVEL_ONLY", "-fstack-usage", "-c", str(source), "-o", str(target)]
         subprocess.run([*run, *flags], check=True, capture_output=True)
         usage = (folder / "policy.su").read_text(encoding="utf-8")
         flash, data, bss = _sections(target)
@@ -240,8 +240,8 @@ def cortex_m4_report(path: Path) -> str:
     if size is None:
         return "Cortex-M4 size: not measured (arm-none-eabi-gcc not found; Debian: apt install gcc-arm-none-eabi)"
     return (
-        f"Cortex-M4, low level: {size.flash} bytes of flash, {size.library} more for the mathematical library; RAM "
-        f"{size.state} bytes of state and at most {size.stack} of stack"
+        f"Cortex-M4, low level in single precision: {size.flash} bytes of flash, {size.library} more for the "
+        f"mathematical library; RAM {size.state} bytes of state and at most {size.stack} of stack"
     )
 
 
@@ -256,7 +256,7 @@ def _linked(run: list[str], folder: Path, source: Path) -> int:
         main.write_text(text, encoding="utf-8")
         elf = folder / f"{name}.elf"
         link = ["--specs=nosys.specs", "-Wl,--gc-sections", str(main), "-o", str(elf), "-lm"]
-        subprocess.run([*run, "-DTBC_LOW_LEVEL_ONLY", *link], check=True, capture_output=True)
+        subprocess.run([*run, "-DTBC_SINGLE", "-DTBC_LOW_LEVEL_ONLY", *link], check=True, capture_output=True)
         sizes[name] = _sections(elf)[0]
     return sizes["full"] - sizes["empty"]
 

@@ -16,6 +16,9 @@ WEIGHTS = ""
 Array = NDArray[Any]
 State = dict[str, Any]
 ARRAYS: dict[str, Array] = dict(np.load(io.BytesIO(base64.b64decode(WEIGHTS)))) if WEIGHTS else {}
+for _name in ARRAYS:
+    if _name.startswith("low.") and SETTINGS["low.kind"] == "circuit":
+        ARRAYS[_name] = ARRAYS[_name].astype(np.float64)  # as the agent itself acts
 CLOSED_FORM = False
 """Set to True to take the circuit's closed form instead of its sub-steps."""
 
@@ -51,8 +54,9 @@ def step(observation: Array, achieved_goal: Array, desired_goal: Array, state: S
         mean = _mlp("low", seen)
     else:
         advance = _relax if CLOSED_FORM else _integrate
-        state["membrane"] = advance(seen, state["membrane"])
-        mean = state["membrane"] @ ARRAYS["low.readout"] + ARRAYS["low.readout_bias"]
+        potentials = advance(seen.astype(np.float64), state["membrane"].astype(np.float64))
+        mean = (potentials @ ARRAYS["low.readout"] + ARRAYS["low.readout_bias"]).astype(np.float32)
+        state["membrane"] = potentials.astype(np.float32)
     state["elapsed"] += 1
     low, high = ARRAYS["action_low"], ARRAYS["action_high"]
     return np.asarray(low + 0.5 * (_squash(mean, 1) + 1.0) * (high - low)), state
@@ -116,7 +120,7 @@ def _drive(seen: Array) -> Array:
 def _integrate(seen: Array, membrane: Array) -> Array:
     """K semi-implicit sub-steps."""
     a, n, p = ARRAYS, len(membrane), len(ARRAYS["low.gain"])
-    pace = a["low.capacitance"] * np.float32(SETTINGS["low.sub_steps"])
+    pace = a["low.capacitance"] * SETTINGS["low.sub_steps"]
     drive = _drive(seen)
     for _ in range(SETTINGS["low.sub_steps"]):
         total = drive + _logistic(membrane[:p] * a["low.gain"] - a["low.threshold"]) @ a["low.recurrent"]

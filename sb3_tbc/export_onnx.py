@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from sb3_tbc.export_policy import MLP, Circuit, Coordinate, ExportedPolicy
+from sb3_tbc.export_policy import MLP, Circuit, Coordinate, ExportedPolicy, FloatArray
 
 OPSET = 17
 STATE_NAMES = ("subgoal", "time_budget", "elapsed", "membrane")
@@ -109,26 +109,38 @@ def _low(g: _Graph, policy: ExportedPolicy, seen: str, over: str, started: str) 
         membrane = g("Mul", "membrane", zeros)
     else:
         membrane = g("Where", over if policy.memory == "window" else started, zeros, "membrane")
-    potentials = g("Identity", _circuit(g, policy.low, seen, membrane), name="next_membrane")
-    return g("Add", g("MatMul", potentials, g.constant(policy.low.readout)), g.constant(policy.low.readout_bias))
+    seen, membrane = (g.cast(x, TensorProto.DOUBLE) for x in (seen, membrane))
+    potentials = _circuit(g, policy.low, seen, membrane)
+    g.cast(potentials, TensorProto.FLOAT, name="next_membrane")
+    readout, bias = (g.constant(x, np.float64) for x in (policy.low.readout, policy.low.readout_bias))
+    return g.cast(g("Add", g("MatMul", potentials, readout), bias), TensorProto.FLOAT)
 
 
 def _circuit(g: _Graph, c: Circuit, seen: str, potentials: str) -> str:
-    """K semi-implicit sub-steps."""
-    n, p = c.n_neurons, len(c.gain)
-    scaled = g("Mul", seen, g.constant(c.input_gain))
-    sensed = g("Sigmoid", g.affine(scaled, c.sensory_gain, -c.sensory_threshold))
-    current = g("Tanh", g("Add", g("MatMul", scaled, g.constant(c.current_weight)), g.constant(c.current_bias)))
-    pace = c.capacitance * np.float32(c.sub_steps)
-    constant = c.rest + np.concatenate([np.zeros(n, np.float32), pace])
-    drive = g("Add", g("MatMul", g.join(sensed, current), g.constant(c.from_inputs)), g.constant(constant))
-    gain, threshold, recurrent, inertia = map(g.constant, (c.gain, -c.threshold, c.recurrent, pace))
+    """K semi-implicit sub-steps, in double precision as the agent itself acts."""
+    n, p, wide = c.n_neurons, len(c.gain), np.float64
+
+    def product(x: str, weight: FloatArray, shift: FloatArray) -> str:
+        return g("Add", g("MatMul", x, g.constant(weight, wide)), g.constant(shift, wide))
+
+    scaled = g("Mul", seen, g.constant(c.input_gain, wide))
+    sensed = _logistic(g, g.affine(scaled, c.sensory_gain, -c.sensory_threshold, wide))
+    current = g("Tanh", product(scaled, c.current_weight, c.current_bias))
+    pace = c.capacitance.astype(wide) * c.sub_steps
+    drive = product(g.join(sensed, current), c.from_inputs, c.rest + np.concatenate([np.zeros(n), pace]))
+    gain, threshold, recurrent, inertia = (g.constant(x, wide) for x in (c.gain, -c.threshold, c.recurrent, pace))
     for _ in range(c.sub_steps):
-        released = g("Sigmoid", g("Add", g("Mul", g.slice(potentials, 0, p), gain), threshold))
+        released = _logistic(g, g("Add", g("Mul", g.slice(potentials, 0, p), gain), threshold))
         received = g("Add", drive, g("MatMul", released, recurrent))
         weighted = g("Add", g("Mul", potentials, inertia), g.slice(received, 0, n))
         potentials = g("Div", weighted, g.slice(received, n, 2 * n))
     return potentials
+
+
+def _logistic(g: _Graph, x: str) -> str:
+    """``1 / (1 + exp(-x))`` in double precision."""
+    one = g.constant(1.0, np.float64)
+    return g("Div", one, g("Add", one, g("Exp", g("Neg", x))))
 
 
 def _mlp(g: _Graph, mlp: MLP, x: str) -> str:

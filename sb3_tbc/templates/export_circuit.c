@@ -1,19 +1,19 @@
 
-static float logistic(float x)
+static tbc_real logistic(tbc_real x)
 {
-    return 1.0f / (1.0f + expf(-x));
+    return 1 / (1 + TBC_EXP(-x));
 }
 
 /* What the inputs contribute to numerator and denominator; constant over the sub-steps of one control step. */
-static void circuit_drive(const float *seen, float *weighted, float *total)
+static void circuit_drive(const float *seen, tbc_real *weighted, tbc_real *total)
 {
-    float released[TBC_SENSORY];
+    tbc_real released[TBC_SENSORY];
     int i, k;
     for (i = 0; i < TBC_SENSORY; ++i) {
         released[i] = logistic(sensory_gain[i] * seen[i] - sensory_threshold[i]);
     }
     for (i = 0; i < TBC_STATE; ++i) {
-        float w = rest_weighted[i], g = rest_total[i];
+        tbc_real w = rest_weighted[i], g = rest_total[i];
         for (k = sensory_begin[i]; k < sensory_begin[i + 1]; ++k) {
             w += sensory_weighted[k] * released[sensory_pre[k]];
             g += sensory_total[k] * released[sensory_pre[k]];
@@ -22,16 +22,16 @@ static void circuit_drive(const float *seen, float *weighted, float *total)
         total[i] = g;
     }
     for (i = 0; i < TBC_INTER; ++i) {
-        float current = current_bias[i];
+        tbc_real current = current_bias[i];
         for (k = current_begin[i]; k < current_begin[i + 1]; ++k) {
             current += current_weight[k] * seen[current_pre[k]];
         }
-        weighted[i] += input_conductance[i] * tanhf(current);
+        weighted[i] += input_conductance[i] * TBC_TANH(current);
     }
 }
 
 /* Adds what the neurons release to numerator and denominator of neuron i. */
-static void circuit_receive(int i, const float *released, float *weighted, float *total)
+static void circuit_receive(int i, const tbc_real *released, tbc_real *weighted, tbc_real *total)
 {
     int k;
     for (k = recurrent_begin[i]; k < recurrent_begin[i + 1]; ++k) {
@@ -40,17 +40,17 @@ static void circuit_receive(int i, const float *released, float *weighted, float
     }
 }
 
-static void circuit_integrate(float *v, const float *weighted, const float *total)
+static void circuit_integrate(tbc_real *v, const tbc_real *weighted, const tbc_real *total)
 {
-    float released[TBC_PRESYNAPTIC];
+    tbc_real released[TBC_PRESYNAPTIC];
     int i, k;
     for (k = 0; k < TBC_SUB_STEPS; ++k) {
         for (i = 0; i < TBC_PRESYNAPTIC; ++i) {
             released[i] = logistic(gain[i] * v[i] - threshold[i]);
         }
         for (i = 0; i < TBC_STATE; ++i) {
-            const float inertia = capacitance[i] * TBC_SUB_STEPS;
-            float w = weighted[i], g = total[i];
+            const tbc_real inertia = (tbc_real)capacitance[i] * TBC_SUB_STEPS;
+            tbc_real w = weighted[i], g = total[i];
             circuit_receive(i, released, &w, &g);
             v[i] = (v[i] * inertia + w) / (g + inertia);
         }
@@ -58,18 +58,18 @@ static void circuit_integrate(float *v, const float *weighted, const float *tota
 }
 
 /* V(t) = (V0 - A) exp(-(w_tau + f) t) + A, layer after layer. */
-static void circuit_relax(float *v, const float *weighted, const float *total)
+static void circuit_relax(tbc_real *v, const tbc_real *weighted, const tbc_real *total)
 {
-    float released[TBC_PRESYNAPTIC];
+    tbc_real released[TBC_PRESYNAPTIC];
     int i, layer, begin = 0;
     for (i = 0; i < TBC_PRESYNAPTIC; ++i) {
         released[i] = logistic(gain[i] * v[i] - threshold[i]);
     }
     for (layer = 0; layer < 3; ++layer) {
         for (i = begin; i < layer_end[layer]; ++i) {
-            float w = weighted[i], g = total[i];
+            tbc_real w = weighted[i], g = total[i];
             circuit_receive(i, released, &w, &g);
-            v[i] -= (w / g - v[i]) * expm1f(-g / capacitance[i]);
+            v[i] -= (w / g - v[i]) * TBC_EXPM1(-g / capacitance[i]);
         }
         for (i = begin; i < layer_end[layer] && i < TBC_PRESYNAPTIC; ++i) {
             released[i] = logistic(gain[i] * v[i] - threshold[i]);
@@ -81,19 +81,25 @@ static void circuit_relax(float *v, const float *weighted, const float *total)
 void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT], int closed_form,
                   float mean[TBC_ACTION])
 {
-    float weighted[TBC_STATE], total[TBC_STATE];
+    tbc_real v[TBC_STATE], weighted[TBC_STATE], total[TBC_STATE];
     int a, i;
+    for (i = 0; i < TBC_STATE; ++i) {
+        v[i] = membrane[i];
+    }
     circuit_drive(seen, weighted, total);
     if (closed_form) {
-        circuit_relax(membrane, weighted, total);
+        circuit_relax(v, weighted, total);
     } else {
-        circuit_integrate(membrane, weighted, total);
+        circuit_integrate(v, weighted, total);
     }
     for (a = 0; a < TBC_ACTION; ++a) {
-        float sum = readout_bias[a];
+        tbc_real sum = readout_bias[a];
         for (i = 0; i < TBC_STATE; ++i) {
-            sum += readout[a * TBC_STATE + i] * membrane[i];
+            sum += readout[a * TBC_STATE + i] * v[i];
         }
-        mean[a] = sum;
+        mean[a] = (float)sum;
+    }
+    for (i = 0; i < TBC_STATE; ++i) {
+        membrane[i] = (float)v[i];
     }
 }

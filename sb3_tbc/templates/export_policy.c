@@ -7,7 +7,8 @@
  *
  * The fifth argument chooses how the circuit is evaluated: 0 integrates its sub-steps as in training, 1 takes the closed
  * form. To use the functions from another file, define TBC_DECLARATIONS_ONLY there and include this one.
- * TBC_LOW_LEVEL_ONLY leaves out the high level.
+ * TBC_LOW_LEVEL_ONLY leaves out the high level. The circuit works in double precision, as predict does; define
+ * TBC_SINGLE for processors that have single precision only, at the price of the fourth digit of an action.
  */
 #ifndef TBC_POLICY
 #define TBC_POLICY
@@ -38,6 +39,18 @@ void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT]
 #include <math.h>
 #include <string.h>
 
+#ifdef TBC_SINGLE
+typedef float tbc_real;
+#define TBC_EXP expf
+#define TBC_EXPM1 expm1f
+#define TBC_TANH tanhf
+#else
+typedef double tbc_real;
+#define TBC_EXP exp
+#define TBC_EXPM1 expm1
+#define TBC_TANH tanh
+#endif
+
 /* ---------------------------------------------------------------- low level */
 
 @LOW_DATA@@LOW_CODE@
@@ -46,9 +59,9 @@ void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT]
 /* ---------------------------------------------------------------- high level and options */
 
 @HIGH_DATA@
-static float squash(float mean, float bound)
+static tbc_real squash(float mean, float bound)
 {
-    return tanhf(fmaxf(-bound, fminf(mean, bound)));
+    return TBC_TANH(fmaxf(-bound, fminf(mean, bound)));
 }
 
 /* Subgoal-space point of a state; only filled in where options may end on reaching their subgoal. */
@@ -71,8 +84,8 @@ static void begin_option(tbc_state *state, const float *observation, const float
 @HIGH_INPUTS@
     high_network(seen, unit);
     for (i = 0; i < TBC_SUBGOAL; ++i) {
-        const float half = 0.5f * (squash(unit[i], TBC_HIGH_BOUND) + 1.0f);
-        state->subgoal[i] = subgoal_low[i] + half * (subgoal_high[i] - subgoal_low[i]);
+        const double half = 0.5 * ((double)(float)squash(unit[i], TBC_HIGH_BOUND) + 1.0);
+        state->subgoal[i] = (float)(subgoal_low[i] + half * (subgoal_high[i] - subgoal_low[i]));
     }
     state->time_budget = @BUDGET@;
     state->elapsed = 0;
@@ -112,7 +125,7 @@ void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
     }@REMAINING@
     tbc_low_mean(state->membrane, seen, closed_form, mean);
     for (i = 0; i < TBC_ACTION; ++i) {
-        const float half = 0.5f * (squash(mean[i], TBC_LOW_BOUND) + 1.0f);
+        const float half = 0.5f * ((float)squash(mean[i], TBC_LOW_BOUND) + 1.0f);
         action[i] = action_low[i] + half * (action_high[i] - action_low[i]);
     }
     state->elapsed += 1;
