@@ -30,7 +30,7 @@ def draw_wiring(wiring: NDBCWiring, ax: Any = None, input_names: Sequence[str] |
     if ax is None:
         import matplotlib.pyplot as plt
 
-        _, ax = plt.subplots(figsize=(7.0, 4.0), layout="constrained")
+        _, ax = plt.subplots(figsize=(7.0, 4.0))  # constrained layout takes minutes over so many arrows
     places = _places(wiring)
     sensory, neurons = places[: wiring.n_inputs], places[wiring.n_inputs :]
     for sources, signs in ((sensory, wiring.sensory), (neurons, wiring.recurrent)):
