@@ -17,8 +17,9 @@ import torch as th
 
 from sb3_tbc.cli import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.algorithms import algorithm, build_model
-from sb3_tbc.zoo.config import CONFIGS, RunConfig, config_file, load_config, parse_overrides, read_file
+from sb3_tbc.zoo.config import CONFIGS, RunConfig, config_file, load_config, merge, parse_overrides, read_file
 from sb3_tbc.zoo.environments import make_envs, resolve_env
 from sb3_tbc.zoo.scores import ACROSS, OBJECTIVES
 from sb3_tbc.zoo.search_space import complete, load_space, restrict
@@ -48,7 +49,7 @@ def build_parser() -> Parser:
     """The command's arguments."""
     parser = Parser("sb3_tbc.tune", description=__doc__)
     add = parser.add_argument
-    add("--algo", default="tbc-hrl", help="tbc-hrl or hits")
+    add("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
     add("--env", default="Pendulum", help="a task's short name or any registered goal environment id")
     add("--study-name", help="an existing one is resumed; by default <algo>-<task>")
     add("--n-trials", type=positive_int, default=30, help="trials of the whole study, those done before included")
@@ -152,8 +153,10 @@ def _checked(run: RunConfig, env_id: str) -> RunConfig:
     try:
         action_dim = int(math.prod(env.action_space.shape or (1,)))
         run = complete(run, action_dim)
-        levels = {level: {**(run.model.get(level) or {}), "buffer_size": 100} for level in ("low", "high")}
-        build_model(replace(run, model={**run.model, **levels}), env, 0)
+        hierarchical = issubclass(algorithm(run.algo), TBCHRL)
+        small: dict[str, Any] = {"buffer_size": 1000}
+        small = {level: small for level in ("low", "high")} if hierarchical else small
+        build_model(replace(run, model=merge(run.model, small)), env, 0)
     finally:
         env.close()
     return run

@@ -278,14 +278,14 @@ def restrict(
         if not fnmatch.filter(declared, pattern):
             raise ConfigError(f"--search {pattern!r} matches no parameter; {nearest(pattern, declared)}")
     space = {p.name: p for p in build_space(declared)}
-    has_circuit = read_key(run, CIRCUIT) is not None
+    idle = _idle_keys(run)
     left: dict[str, dict[str, Any]] = {}
     for name, parameter in space.items():
         keys = tuple(key for key in parameter.keys if not _is_set(fixed, key))
         without = (parameter.keys and not keys) or any(_is_set(fixed, k) for s in parameter.sets.values() for k in s)
         if without or (wanted and not any(fnmatch.fnmatch(name, pattern) for pattern in wanted)):
             continue
-        if not has_circuit and any(key.startswith(CIRCUIT) for key in keys):
+        if any(key.startswith(idle) for key in keys):
             continue
         fields = dict(declared[name])
         if parameter.when and parameter.when[0] not in left:
@@ -296,6 +296,14 @@ def restrict(
     if not left:
         raise ConfigError("nothing is left to search: --search and --hyperparams leave out every parameter")
     return left
+
+
+def _idle_keys(run: RunConfig) -> tuple[str, ...]:
+    """Beginnings of keys that change nothing: a circuit where there is none, the rule's scale where nobody asks it."""
+    idle = [] if read_key(run, CIRCUIT) is not None else [CIRCUIT]
+    if read_key(run, "duration") != "rule" and not read_key(run, "duration_loss_coef"):
+        idle.append("kappa")
+    return tuple(idle)
 
 
 def _is_set(settings: Mapping[str, Any], key: str) -> bool:
@@ -366,7 +374,8 @@ def complete(run: RunConfig, action_dim: int) -> RunConfig:
     """
     low = run.model.get("low") or {}
     policy_kwargs = low.get("policy_kwargs") or {}
-    circuit = policy_kwargs.get("ndbc", {}) if algorithm(run.algo).default_circuit else policy_kwargs.get("ndbc")
+    has_default = getattr(algorithm(run.algo), "default_circuit", False)
+    circuit = policy_kwargs.get("ndbc", {}) if has_default else policy_kwargs.get("ndbc")
     if circuit is None:
         return run
     written = {**DEFAULT_WIRING, "motor": action_dim, "sub_steps": SUB_STEPS, **circuit}

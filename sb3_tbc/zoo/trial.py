@@ -30,6 +30,9 @@ CURVES = "curves"
 DIVERGED = 1e6
 """Critic loss at which a run counts as diverging; returns here are of the order of 10 to 100, so losses of 1e4."""
 
+NOT_A_DISTRIBUTION = "to satisfy the constraint"
+"""How torch says that an actor's mean is NaN."""
+
 
 class Surplus(Exception):
     """Two workers began the last trial at the same time; the later one lets go."""
@@ -148,7 +151,11 @@ class TrialRunner:
             result = start_run(spec, folder, command, self.options, True, ReportCallback(report))
         except FloatingPointError as error:
             raise optuna.TrialPruned(f"not finite: {error} (seed {seed})") from error
-        except ConfigError as error:
+        except ValueError as error:
+            if not isinstance(error, ConfigError):
+                if NOT_A_DISTRIBUTION in str(error):  # SB3's own SAC does not look at its weights
+                    raise optuna.TrialPruned(f"not finite: the actor's distribution (seed {seed})") from error
+                raise
             if trial.user_attrs.get(ORIGIN):
                 raise
             raise optuna.TrialPruned(f"refused: {error}") from error
