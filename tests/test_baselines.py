@@ -36,7 +36,8 @@ def test_hac_has_no_time() -> None:
     assert model.low.state_dim == 0
     for level in (model.high, model.low):  # all rewards are -1 or 0
         assert level.policy.critic.negative
-    assert model.high_reward.discounts(np.array([1, 7])).tolist() == [0.98, 0.98]
+    gamma = model.high_settings["gamma"]  # per decision, however long it took
+    assert model.high_reward.discounts(np.array([1, 7])).tolist() == [gamma, gamma]
     assert model.high_reward.duration_cost == 0
 
 
