@@ -57,6 +57,7 @@ def build_parser() -> Parser:
     parser.add_argument("--variant", help="name of the runs' folder; by default from the configuration")
     parser.add_argument("--n-timesteps", type=positive_int)
     parser.add_argument("--eval-freq", type=positive_int)
+    parser.add_argument("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (20)")
     parser.add_argument("--n-final-episodes", type=positive_int, default=100)
     parser.add_argument("--hyperparams", nargs="+", default=[], metavar="K:V")
     parser.add_argument("--log-folder", type=Path, default=Path("runs"))
@@ -84,7 +85,8 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
                 for flag, value in (("--config", args.config), ("--n-timesteps", args.n_timesteps)):
                     arguments += [flag, str(value)] if value else []
                 arguments += ["--ablation", args.ablation] if args.ablation else []
-                arguments += ["--eval-freq", str(args.eval_freq)] if args.eval_freq else []
+                for flag, value in (("--eval-freq", args.eval_freq), ("--n-eval-episodes", args.n_eval_episodes)):
+                    arguments += [flag, str(value)] if value else []
                 arguments += ["--hyperparams", *args.hyperparams] if args.hyperparams else []
                 folder, target = (RunFolder.of(r, task, algo, variant, seed) for r in (args.log_folder, args.ledger))
                 yield Job(algo, name, seed, folder, target, tuple(arguments))
