@@ -218,12 +218,9 @@ def test_every_shipped_section_builds(task: str, algo: str, config: str) -> None
     state_dim = model.low.policy.actor.state_dim
     assert state_dim == (0 if circuit is None else circuit["inter"] + circuit["command"] + circuit["motor"])
     assert model.rules.window_end == run.model["window_end"]
-    caps = dict(WINDOW_CAPS)
-    if algo == "hac":
-        caps |= {"AntFourRooms": 27.0, "Pendulum": 37.037}
-    if (algo, config) == ("tbc-hrl", "tuned"):
-        caps |= {"Pendulum": 37.037}  # 27 options
-    cap = caps[task]
+    cap = (
+        {"AntFourRooms": 27.0, "Pendulum": 37.037}.get(task, WINDOW_CAPS[task]) if algo == "hac" else WINDOW_CAPS[task]
+    )
     assert model.rules.dt_max == pytest.approx(cap, abs=1e-3)
 
 
