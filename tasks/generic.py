@@ -109,8 +109,8 @@ def describe_goal_env(
 
     Subgoals are points of ``achieved_goal``. What is not given comes from the environment: bounds from a finite
     ``achieved_goal`` Box, else from where desired goals and nine tenths of the achieved ones lie in random episodes,
-    widened by a tenth;
-    thresholds from ``distance_threshold`` (Euclidean), else 5 % of each range; scales from the random episodes.
+    widened by a tenth; thresholds from ``distance_threshold`` (Euclidean), else from how far off its rewards still
+    count as the goal, else 5 % of each range; scales from the random episodes.
 
     :param env: a goal environment; random episodes are run in a copy made from its spec, or in it if it has none
     :param low: lower bounds of subgoals, ``(goal_dim,)``
@@ -275,11 +275,47 @@ def _thresholds(
 ) -> tuple[NDArray[np.float64], list[list[int]] | None]:
     """Thresholds and the groups whose distance they limit (``None``: each coordinate by itself)."""
     together = [list(range(len(low)))]
-    if given is None:
-        distance = getattr(env.unwrapped, "distance_threshold", None)
-        return (0.05 * (high - low), None) if distance is None else (np.array([float(distance)]), together)
-    limits = np.atleast_1d(np.asarray(given, dtype=np.float64))
-    return limits, together if len(limits) == 1 and len(low) > 1 else None
+    if given is not None:
+        limits = np.atleast_1d(np.asarray(given, dtype=np.float64))
+        return limits, together if len(limits) == 1 and len(low) > 1 else None
+    distance = getattr(env.unwrapped, "distance_threshold", None)
+    if distance is not None:
+        return np.array([float(distance)]), together
+    tolerances = _tolerances(env, low, high)
+    if tolerances is None:
+        return 0.05 * (high - low), None
+    if len(low) > 1 and np.allclose(tolerances, tolerances[0], rtol=1e-3) and not _counts(env, low, high, tolerances):
+        return tolerances[:1], together
+    return tolerances, None
+
+
+def _counts(
+    env: gym.Env[Any, Any], low: NDArray[np.float64], high: NDArray[np.float64], offset: NDArray[np.float64]
+) -> bool:
+    """Whether a point nine tenths of ``offset`` away from a goal in the middle has the goal's own reward."""
+    compute: Any = env.unwrapped.compute_reward  # type: ignore[attr-defined]
+    goal = 0.5 * (low + high)
+    return bool(np.isclose(compute(goal + 0.9 * offset, goal, {}), compute(goal, goal.copy(), {})))
+
+
+def _tolerances(
+    env: gym.Env[Any, Any], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NDArray[np.float64] | None:
+    """Per coordinate, how far off the goal its reward still holds, by bisection; ``None`` if rewards do not tell."""
+    compute: Any = env.unwrapped.compute_reward  # type: ignore[attr-defined]
+    goal, tolerances = 0.5 * (low + high), np.empty(len(low))
+    best = float(compute(goal, goal.copy(), {}))
+    for i, half in enumerate(0.5 * (high - low)):
+        inside, outside = 0.0, float(half)
+        for _ in range(20):
+            middle = 0.5 * (inside + outside)
+            point = goal.copy()
+            point[i] += middle
+            inside, outside = (middle, outside) if float(compute(point, goal, {})) == best else (inside, middle)
+        if not 1e-3 * half < inside < 0.999 * half:  # a dense reward falls at once, a coordinate without say never
+            return None
+        tolerances[i] = inside
+    return tolerances
 
 
 def _contains(observation: NDArray[np.float64], achieved: NDArray[np.float64]) -> bool:

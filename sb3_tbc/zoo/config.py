@@ -154,6 +154,9 @@ def load_config(
     merged = merge(default, section)
     for change in (tuned if config == "tuned" else {}, ABLATIONS.get(ablation or "", {}), overrides or {}):
         merged = merge(merged, change)
+    subgoals = merged.pop("subgoals", None)
+    if subgoals:  # belongs to the environment, and stays with it in a saved agent
+        merged["env_kwargs"] = {**(merged.get("env_kwargs") or {}), "subgoals": subgoals}
     run = {key: merged.pop(key) for key in RUN if merged.get(key) is not None}
     if run.get("n_timesteps", 0) <= 0 or run.get("n_envs", 1) <= 0:
         raise ConfigError(f"n_timesteps and n_envs must be positive, got {run}")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
+import traceback
 from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_tbc  # noqa: F401  (registers the tasks)
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly
 from sb3_tbc.tasks.generic import DescribedGoalEnv
 from sb3_tbc.zoo.schema import nearest
 
@@ -30,21 +32,39 @@ def task_names() -> dict[str, str]:
 def resolve_env(name: str) -> tuple[str, str]:
     """Task name and environment id of ``Pendulum``, ``sb3_tbc/Pendulum-v0``, any registered id, or ``module:id``.
 
+    Ids of Gymnasium-Robotics need no module: where it is installed, ``FetchReach-v4`` finds it.
+
+    :return: name (of run folders and of sections in configuration files) and id, the latter with its module, so that a
+        saved agent finds its environment again
     :raises ConfigError: naming the nearest known one
     """
     tasks = task_names()
     if name in tasks:
         return name, tasks[name]
-    module, separator, env_id = name.rpartition(":")
-    if separator:
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            raise ConfigError(f"cannot import module {module!r} of environment {name!r}: {error}") from error
+    module, _, env_id = name.rpartition(":")
+    if module:
+        _import(module, name)
+    home = module or (home_of(env_id) if "-v" in env_id else None)
     if env_id in gym.registry:
         short = {i: task for task, i in tasks.items()}
-        return short.get(env_id, env_id), name  # with its module, so that a saved agent finds its environment again
-    raise ConfigError(f"unknown environment {name!r}; {nearest(name, _known(name, tasks))}")
+        return short.get(env_id, env_id), f"{home}:{env_id}" if home else env_id
+    raise ConfigError(f"unknown environment {name!r}; {nearest(name, _known(name, tasks))}{_hint(env_id)}")
+
+
+def _import(module: str, name: str) -> None:
+    try:
+        import_quietly(module)
+    except ImportError as error:
+        raise ConfigError(f"cannot import module {module!r} of environment {name!r}: {error}") from error
+
+
+def _hint(env_id: str) -> str:
+    """What to install for an id that looks like one of Gymnasium-Robotics."""
+    if any(i.startswith(("Fetch", "PointMaze", "AntMaze")) for i in gym.registry) or not env_id.startswith(
+        ("Fetch", "PointMaze", "AntMaze", "Adroit", "Hand", "FrankaKitchen")
+    ):
+        return ""
+    return f"; it is one of {ROBOTICS}'s: pip install gymnasium-robotics"
 
 
 def _known(name: str, tasks: Mapping[str, str]) -> list[str]:
@@ -58,13 +78,21 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[st
     :param env_id: as registered
     :param n_envs: how many
     :param seed: environment ``i`` gets ``seed + i``
-    :param env_kwargs: for ``gymnasium.make``
-    :raises ConfigError: if it cannot be made, is no goal environment, or its actions are not a Box
+    :param env_kwargs: for ``gymnasium.make``; ``subgoals`` goes to
+        :class:`~sb3_tbc.tasks.generic.DescribedGoalEnv` instead (``low``, ``high``, ``thresholds``, ``names``)
+    :raises ConfigError: if it cannot be made, is no goal environment, its actions are not a Box, or it is told about
+        subgoals although it brings its own
     """
+    module = env_id.rpartition(":")[0]
+    if module:
+        _import(module, env_id)
     try:
         env = make_vec_env(partial(_make, env_id), n_envs, seed=seed, env_kwargs=dict(env_kwargs or {}))
-    except (gym.error.Error, ImportError, TypeError, ValueError) as error:
-        raise ConfigError(f"cannot make environment {env_id!r} with {dict(env_kwargs or {})}: {error}") from error
+    except ConfigError:
+        raise
+    except Exception as error:  # An environment's own code may fail in any way.
+        given = f" with {dict(env_kwargs)}" if env_kwargs else ""
+        raise ConfigError(f"cannot make environment {env_id!r}{given}: {_cause(error)}") from error
     try:
         check_goal_env(env, env_id)
     except ConfigError:
@@ -73,15 +101,28 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[st
     return env
 
 
-def _make(env_id: str, **env_kwargs: Any) -> gym.Env[Any, Any]:
+def _cause(error: Exception) -> str:
+    """Return one line: the message where there is one of use, else also kind and place."""
+    if isinstance(error, (gym.error.Error, ImportError, TypeError, ValueError)) and str(error):
+        return str(error)
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    message = str(error) or place.line or "no message"
+    return f"{type(error).__name__} in {Path(place.filename).name}, line {place.lineno}: {message}"
+
+
+def _make(env_id: str, subgoals: Mapping[str, Any] | None = None, **env_kwargs: Any) -> gym.Env[Any, Any]:
     """Make one environment; a goal environment that does not say what to ask for gets a derived subgoal space."""
     try:
         env = gym.make(env_id, **{"render_mode": "rgb_array", **env_kwargs})
     except TypeError:
         env = gym.make(env_id, **env_kwargs)
+    if hasattr(env.unwrapped, "subgoals"):
+        if subgoals:
+            raise ConfigError(f"{env_id!r} brings its own subgoal space; leave out `subgoals`, got {dict(subgoals)}")
+        return env
     keys = env.observation_space.spaces if isinstance(env.observation_space, spaces.Dict) else {}
     is_goal_env = all(key in keys for key in GOAL_KEYS) and isinstance(env.action_space, spaces.Box)
-    return env if not is_goal_env or hasattr(env.unwrapped, "subgoals") else DescribedGoalEnv(env)
+    return DescribedGoalEnv(env, **(subgoals or {})) if is_goal_env else env
 
 
 def check_goal_env(env: VecEnv, env_id: str) -> None:

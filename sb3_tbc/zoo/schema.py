@@ -3,14 +3,32 @@
 from __future__ import annotations
 
 import difflib
+import math
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from sb3_tbc.errors import ConfigError
 
 Schema = dict[str, Any]
-"""Key -> kind: a type, a tuple of types, a frozenset of allowed strings, or a nested schema (``None`` allowed)."""
+"""Key -> kind: a type, a tuple of types, a frozenset of allowed strings, :class:`ListOf`, or a nested schema.
+
+``None`` is allowed everywhere.
+"""
+
+
+@dataclass(frozen=True)
+class ListOf:
+    """A list with entries of one kind.
+
+    :param kind: of the entries, as in a schema; numbers have to be finite
+    :param single: whether one entry may stand without its list
+    """
+
+    kind: Any
+    single: bool = False
+
 
 NUMBER = (int, float)
 _FLOAT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
@@ -43,6 +61,15 @@ LEVEL: Schema = {
 }
 RUN: Schema = {"n_timesteps": int, "n_envs": int, "env_kwargs": dict}
 """Keys the runner reads itself; all others go to the algorithm's constructor."""
+
+SUBGOALS: Schema = {
+    "low": ListOf(NUMBER),
+    "high": ListOf(NUMBER),
+    "thresholds": ListOf(NUMBER, single=True),
+    "names": ListOf(str),
+    "n_probe_steps": int,
+}
+"""Subgoals of an environment that does not bring its own, see :func:`sb3_tbc.tasks.generic.describe_goal_env`."""
 
 MODEL: Schema = {
     "policy": str,
@@ -84,7 +111,7 @@ FLAT: Schema = {
 }
 """What an agent of one level takes at the top of a section, besides some of :data:`MODEL`'s keys."""
 
-SECTION: Schema = {**RUN, **MODEL, **FLAT}
+SECTION: Schema = {**RUN, "subgoals": SUBGOALS, **MODEL, **FLAT}
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
@@ -129,6 +156,8 @@ def _value(value: Any, kind: Any, where: str) -> Any:
         if not isinstance(value, Mapping):
             raise ConfigError(f"{where} must be a section with keys {', '.join(sorted(kind))}, got {value!r}")
         return validate(value, kind, where)
+    if isinstance(kind, ListOf):
+        return _list(value, kind, where)
     if isinstance(kind, frozenset):
         if value not in kind:
             raise ConfigError(f"{where} must be one of {', '.join(sorted(kind))}, got {value!r}")
@@ -140,3 +169,14 @@ def _value(value: Any, kind: Any, where: str) -> Any:
         names = " or ".join(k.__name__ for k in kinds)
         raise ConfigError(f"{where} must be {names}, got {value!r} ({type(value).__name__})")
     return value
+
+
+def _list(value: Any, kind: ListOf, where: str) -> Any:
+    if not isinstance(value, list):
+        if kind.single:
+            return _value(value, kind.kind, where)
+        raise ConfigError(f"{where} must be a list, got {value!r}")
+    entries = [_value(item, kind.kind, f"{where}[{i}]") for i, item in enumerate(value)]
+    if not entries or any(item is None or (isinstance(item, float) and not math.isfinite(item)) for item in entries):
+        raise ConfigError(f"{where} must be a list of finite values, got {value!r}")
+    return entries
