@@ -50,7 +50,7 @@ def ant_xml() -> str:
     return f"""
 <mujoco model="ant_four_rooms">{ASSETS}
   <compiler angle="degree" inertiafromgeom="true" autolimits="true"/>
-  <option timestep="0.02" integrator="RK4"><flag island="disable"/></option>
+  <option timestep="0.02" integrator="RK4"><flag island="disable" midphase="disable"/></option>
   <size njmax="500" nconmax="200"/>
   <default>
     <joint armature="1" damping="1"/>
@@ -159,8 +159,8 @@ class AntFourRooms(MujocoTask):
         wrenches = np.clip(self.data.cfrc_ext[:14], -1.0, 1.0)
         return np.concatenate([self._qpos[2:], self._qvel, wrenches.ravel()]), achieved
 
-    def _make_scene(self) -> Scene:
-        return Scene(self.model, (640, 640), lookat=(0.0, 0.3, 0.0), distance=25.0, azimuth=90.0, elevation=-75.0)
+    def _make_scene(self, model: mujoco.MjModel) -> Scene:
+        return Scene(model, (640, 640), lookat=(0.0, 0.3, 0.0), distance=25.0, azimuth=90.0, elevation=-75.0)
 
     def _add_markers(self, scene: Scene) -> None:
         scene.add_geom(mujoco.mjtGeom.mjGEOM_BOX, self.goal_tolerance, self._goal, GOAL_RGBA)

@@ -79,7 +79,7 @@ class Scene:
         azimuth: float,
         elevation: float,
     ) -> None:
-        self._model, (width, height) = model, size
+        self.model, (width, height) = model, size
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._gl, self._context = _open_context(model, width, height)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
@@ -96,7 +96,7 @@ class Scene:
     def update(self, data: mujoco.MjData) -> None:
         """Take over the present poses; forgets ghosts and markers."""
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
-        mujoco.mjv_updateScene(self._model, data, self._option, self._perturb, self._camera, everything, self.scene)
+        mujoco.mjv_updateScene(self.model, data, self._option, self._perturb, self._camera, everything, self.scene)
 
     def add_ghost(self, qpos: ArrayLike, rgba: Sequence[float], without: Sequence[int] = ()) -> None:
         """Add the moving bodies in another configuration, in one translucent colour.
@@ -105,9 +105,9 @@ class Scene:
         """
         ghost, first = self._ghost_data, self.scene.ngeom
         ghost.qpos[:] = qpos
-        mujoco.mj_kinematics(self._model, ghost)
+        mujoco.mj_kinematics(self.model, ghost)
         dynamic = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
-        mujoco.mjv_addGeoms(self._model, ghost, self._option, self._perturb, dynamic, self.scene)
+        mujoco.mjv_addGeoms(self.model, ghost, self._option, self._perturb, dynamic, self.scene)
         for geom in self.scene.geoms[first : self.scene.ngeom]:
             geom.rgba[:] = (0.0, 0.0, 0.0, 0.0) if geom.objid in without else rgba
             geom.matid = -1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from typing import ClassVar
 
 import mujoco
@@ -23,6 +24,9 @@ class MujocoTask(GoalTask):
     """
 
     xml: ClassVar[str]
+    """The model that is stepped."""
+    drawn_xml: ClassVar[str | None] = None
+    """The same joints with what is only to be seen: shapes that collide with nothing would slow every step down."""
     frame_skip: ClassVar[int]
     dynamics_names: ClassVar[tuple[str, ...]] = ("mass", "damping", "gravity", "friction", "actuator")
 
@@ -36,7 +40,7 @@ class MujocoTask(GoalTask):
         self._qvel: Array = self.data.qvel
         self._ctrl: Array = self.data.ctrl
         self._scene: Scene | None = None
-        self._nominal = {name: [field.copy() for field in fields] for name, fields in _fields(self.model).items()}
+        self._nominal = nominal_fields(self.model)
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
 
     @abstractmethod
@@ -63,15 +67,15 @@ class MujocoTask(GoalTask):
         return {"qpos": self._qpos.copy(), "qvel": self._qvel.copy()}
 
     def _apply_dynamics(self, scales: dict[str, float]) -> None:
-        for name, fields in _fields(self.model).items():
-            for field, nominal in zip(fields, self._nominal[name], strict=True):
-                field[:] = nominal * scales.get(name, 1.0)
-        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+        scale_fields(self.model, self._nominal, scales)
 
     # -- pictures --------------------------------------------------------------------------------------------------
 
-    def _make_scene(self) -> Scene:
-        """The camera on this task."""
+    def _make_scene(self, model: mujoco.MjModel) -> Scene:
+        """The camera on this task.
+
+        :param model: what is to be drawn
+        """
         raise NotImplementedError
 
     def _add_markers(self, scene: Scene) -> None:
@@ -79,10 +83,11 @@ class MujocoTask(GoalTask):
 
     def _draw(self) -> NDArray[np.uint8]:
         if self._scene is None:
-            self._scene, self._drawn = self._make_scene(), mujoco.MjData(self.model)
+            model = self.model if self.drawn_xml is None else mujoco.MjModel.from_xml_string(self.drawn_xml)
+            self._scene, self._drawn = self._make_scene(model), mujoco.MjData(model)
         # Drawing works on a copy, because kinematics on the simulator's own data would change what a step returns.
         self._drawn.qpos[:] = self._qpos
-        mujoco.mj_kinematics(self.model, self._drawn)
+        mujoco.mj_kinematics(self._drawn.model, self._drawn)
         self._scene.update(self._drawn)
         self._add_markers(self._scene)
         canvas = Canvas.over(self._scene.picture())
@@ -98,12 +103,29 @@ class MujocoTask(GoalTask):
             self._scene = None
 
 
+def nominal_fields(model: mujoco.MjModel) -> dict[str, list[Array]]:
+    """Copies of the numbers that :func:`scale_fields` changes."""
+    return {name: [field.copy() for field in fields] for name, fields in _fields(model).items()}
+
+
+def scale_fields(model: mujoco.MjModel, nominal: dict[str, list[Array]], scales: Mapping[str, float]) -> None:
+    """Set a model's numbers to multiples of their nominal values.
+
+    :param nominal: from :func:`nominal_fields`
+    :param scales: factors by name; 1 where absent
+    """
+    for name, fields in _fields(model).items():
+        for field, value in zip(fields, nominal[name], strict=True):
+            field[:] = value * scales.get(name, 1.0)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
 def _fields(model: mujoco.MjModel) -> dict[str, list[Array]]:
     """Views of the model's numbers behind each name of ``dynamics_names``."""
     return {
         "mass": [model.body_mass, model.body_inertia],
         "damping": [model.dof_damping],
         "gravity": [model.opt.gravity],
-        "friction": [model.geom_friction[:, :1]],
+        "friction": [model.geom_friction[:, :1], model.pair_friction[:, :2]],
         "actuator": [model.actuator_gainprm[:, :1], model.actuator_biasprm[:, :3]],
     }

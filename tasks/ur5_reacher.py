@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
+import mujoco
 import numpy as np
 
 from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
@@ -21,17 +22,60 @@ TYPICAL_ANGLE = 1.2  # rad, what the joints move by in an episode
 BASE_HEIGHT, UPPER_ARM, FOREARM = 0.089159, 0.425, 0.39225
 START = (3.22757851e-03, -1.27944547e-01)
 
-MODEL = f"""
-<mujoco model="ur5">{ASSETS}
+MODEL = """
+<mujoco model="ur5">
   <compiler angle="radian" autolimits="true"/>
-  <option timestep="0.002" gravity="0 0 -9.81" cone="elliptic" impratio="5" tolerance="1e-10">
+  <option timestep="0.002" gravity="0 0 -9.81" cone="elliptic" impratio="5" tolerance="1e-4">
     <flag island="disable"/>
   </option>
   <default>
-    <geom condim="4" solref="0.01 1" solimp="0.99 0.99 0.01"/>
+    <geom contype="0" conaffinity="0"/>
+    <pair condim="3" solref="0.01 1" solimp="0.99 0.99 0.01" friction="1 1 0.005 0.0001 0.0001"/>
     <joint type="hinge" damping="10"/>
     <general gaintype="fixed" biastype="affine" gainprm="10" biasprm="0 0 -10" forcerange="-150 150"/>
   </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 0.1"/>
+    <geom name="base" type="cylinder" size="0.0735 0.012" pos="0 0 0.009"/>
+    <body name="shoulder_link" pos="0 0 0.089159">
+      <inertial pos="0 0 0" mass="3.7" diaginertia="0.0102675 0.0102675 0.00666"/>
+      <joint name="shoulder_pan" axis="0 0 1"/>
+      <geom name="shoulder" type="cylinder" size="0.0595 0.0668" pos="0 0 0.0016"/>
+      <body name="upper_arm_link" pos="0 0.13585 0" quat="0.707107 0 0.707107 0">
+        <inertial pos="0 0 0.28" mass="8.393" diaginertia="0.226891 0.226891 0.0151074"/>
+        <joint name="shoulder_lift" axis="0 1 0"/>
+        <geom name="elbow" type="sphere" size="0.0597" pos="0 0 0.425"/>
+        <body name="forearm_link" pos="0 -0.1197 0.425">
+          <inertial pos="0 0 0.25" mass="2.275" diaginertia="0.0494433 0.0494433 0.004095"/>
+          <joint name="elbow" axis="0 1 0"/>
+          <geom name="forearm" type="capsule" size="0.0385" fromto="0 0 0.12 0 0 0.4"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <contact>
+    <pair geom1="floor" geom2="elbow"/>
+    <pair geom1="floor" geom2="forearm"/>
+    <pair geom1="base" geom2="forearm"/>
+    <pair geom1="shoulder" geom2="forearm"/>
+  </contact>
+  <actuator>
+    <general joint="shoulder_pan" ctrlrange="-3.15 3.15"/>
+    <general joint="shoulder_lift" ctrlrange="-5 5"/>
+    <general joint="elbow" ctrlrange="-3.15 3.15"/>
+  </actuator>
+</mujoco>
+"""
+"""What is stepped: the original's masses, joints and servos, and as few shapes as move on the floor like its meshes.
+
+Only where the upper arm ends and the forearm ends touch the floor. One sphere and one capsule, one contact each, follow
+the original closer than a set of cylinders and boxes that fills the links, and take half the time.
+"""
+
+DRAWN_MODEL = f"""
+<mujoco model="ur5">{ASSETS}
+  <compiler angle="radian" autolimits="true"/>
+  <default><joint type="hinge"/></default>
   <worldbody>
     <light pos="1 -1 3" dir="-0.3 0.3 -1" directional="true" diffuse="0.5 0.5 0.5"/>
     <geom name="floor" type="plane" size="5 5 0.1" material="tiles"/>
@@ -60,13 +104,9 @@ MODEL = f"""
       </body>
     </body>
   </worldbody>
-  <actuator>
-    <general joint="shoulder_pan" ctrlrange="-3.15 3.15"/>
-    <general joint="shoulder_lift" ctrlrange="-5 5"/>
-    <general joint="elbow" ctrlrange="-3.15 3.15"/>
-  </actuator>
 </mujoco>
 """
+"""The arm as it is drawn."""
 
 
 class UR5Reacher(MujocoTask):
@@ -82,7 +122,7 @@ class UR5Reacher(MujocoTask):
     * Start: pan within +-pi/8, the arm almost straight and level, at rest.
     * Subgoals (6): goal angles and velocities clipped to +-4 rad/s; thresholds 10 degrees and 2 rad/s.
 
-    The links' collision hulls are primitives fitted to the original meshes; free motion is the original's.
+    A sphere and a capsule stand for the original collision meshes; free motion is the original's.
 
     Quirks kept: one simulator sub-step at reset; no wrap-around between +350 and -10 degrees; training goals are the
     evaluation goals. Mended (unless ``legacy_quirks=True``): the sub-step at reset acts under the last command of the
@@ -90,6 +130,7 @@ class UR5Reacher(MujocoTask):
     """
 
     xml: ClassVar[str] = MODEL
+    drawn_xml: ClassVar[str | None] = DRAWN_MODEL
     frame_skip: ClassVar[int] = 15
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 33}
     max_episode_steps = 600
@@ -127,11 +168,11 @@ class UR5Reacher(MujocoTask):
             return np.array(frame), achieved
         return self._history.reset(frame) if first else self._history.push(frame), achieved
 
-    def _make_scene(self) -> Scene:
-        return Scene(self.model, (640, 480), lookat=(0.0, 0.0, 0.32), distance=2.3, azimuth=150.0, elevation=-25.0)
+    def _make_scene(self, model: mujoco.MjModel) -> Scene:
+        return Scene(model, (640, 480), lookat=(0.0, 0.0, 0.32), distance=2.3, azimuth=150.0, elevation=-25.0)
 
     def _add_markers(self, scene: Scene) -> None:
-        shoulder = np.flatnonzero(self.model.geom_bodyid == self.model.body("shoulder_link").id)
+        shoulder = np.flatnonzero(scene.model.geom_bodyid == scene.model.body("shoulder_link").id)
         for ghost, rgba in ((self._goal, GOAL_RGBA), (self._overlay[0], SUBGOAL_RGBA)):
             if ghost is not None:
                 scene.add_ghost(ghost[:3], rgba, without=shoulder.tolist())

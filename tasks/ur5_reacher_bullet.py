@@ -40,23 +40,14 @@ URDF_LINKS = (  # name, mass, centre of mass, diagonal inertia, shapes: (urdf ge
         8.393,
         "0 0 0.28",
         (0.226891, 0.226891, 0.0151074),
-        [
-            ("cylinder", 0.0597, 0.1338, "0 0.0017 0", "1.5707963267948966 0 0"),
-            ("cylinder", 0.0597, 0.1324, "0 0.001 0.425", "1.5707963267948966 0 0"),
-            ("box", (0.1194, 0.1338, 0.425), None, "0 0.0017 0.2125", "0 0 0"),
-        ],
+        [("sphere", 0.0597, None, "0 0 0.425", "0 0 0")],
     ),
     (
         "forearm_link",
         2.275,
         "0 0 0.25",
         (0.0494433, 0.0494433, 0.004095),
-        [
-            ("sphere", 0.058, None, "0 0 0", "0 0 0"),
-            ("capsule", 0.0525, 0.1, "0 0 0.1", "0 0 0"),
-            ("capsule", 0.0455, 0.12, "0 0 0.21", "0 0 0"),
-            ("cylinder", 0.0385, 0.1613, "0 0 0.35065", "0 0 0"),
-        ],
+        [("capsule", 0.0385, 0.28, "0 0 0.26", "0 0 0")],
     ),
 )
 URDF_JOINTS = (  # name, origin, rpy, axis
@@ -271,7 +262,5 @@ def _link(name: str, mass: float, com: str, inertia: tuple[float, ...], shapes: 
     )
 
 
-def _geometry(kind: str, size: Any, length: float | None) -> str:
-    if kind == "box":
-        return f'<box size="{size[0]} {size[1]} {size[2]}"/>'
+def _geometry(kind: str, size: float, length: float | None) -> str:
     return f'<{kind} radius="{size}"' + (f' length="{length}"/>' if length is not None else "/>")

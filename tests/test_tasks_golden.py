@@ -49,6 +49,12 @@ def replay(env, episode):
     return np.array(errors)
 
 
+def first_steps(task, episode, n):
+    """Errors over the first ``n`` steps of a recording."""
+    cut = {name: array[:n] if name in ("action", "reward", "done") else array for name, array in episode.items()}
+    return replay(make(task), cut)
+
+
 @pytest.mark.parametrize("layout", ["paper", "compact"])
 @pytest.mark.parametrize("task", ["Drawbridge", "Platforms", "Tennis2D"])
 def test_two_dimensional_tasks_are_exact(task, layout):
@@ -64,11 +70,32 @@ def test_drawbridge_is_exact_by_default():
         assert replay(make("Drawbridge"), episode).max() == 0.0
 
 
-@pytest.mark.parametrize("legacy_quirks", [False, True])
-def test_pendulum(legacy_quirks):
+def test_pendulum_replays_to_rounding():
+    """MuJoCo steps the model with ``legacy_quirks``; only the achieved angle is computed in another order."""
     for name, episode in load("Pendulum").items():
-        env = make("Pendulum", legacy_quirks=legacy_quirks)
-        assert replay(env, episode).max() < 1e-9, name
+        assert replay(make("Pendulum", legacy_quirks=True), episode).max() < 1e-14, name
+
+
+def test_pendulum_in_plain_floats():
+    """Full replays, but for the one that balances at the top for ten seconds: rounding grows by 80 in each of them."""
+    for name, episode in load("Pendulum").items():
+        errors = replay(make("Pendulum"), episode) if name != "ep1" else first_steps("Pendulum", episode, 150)
+        assert errors.max() < 1e-9, name
+
+
+def test_pendulum_step_by_step():
+    """From every recorded state, one control step agrees to 1e-12."""
+    env = make("Pendulum")
+    for episode in load("Pendulum").values():
+        for t, action in enumerate(episode["action"]):
+            cos, sin, speed = episode["observation"][t]
+            # One sub-step without torque belongs to a reset; it is undone here.
+            before = np.array([np.arctan2(sin, cos) - 0.002 * speed])
+            velocity = (speed * 0.2512 - 0.002 * 4.905 * np.sin(before)) / 0.251
+            observation, _ = env.reset(options={"goal": episode["goal"], "state": {"qpos": before, "qvel": velocity}})
+            np.testing.assert_allclose(observation["observation"], episode["observation"][t], atol=1e-13)
+            observation = env.step(action)[0]
+            np.testing.assert_allclose(observation["observation"], episode["observation"][t + 1], atol=1e-12)
 
 
 @pytest.mark.parametrize("layout", ["paper", "compact"])
@@ -85,15 +112,24 @@ def test_ur5_off_the_floor():
 
 
 def test_ur5_on_the_floor_stays_close():
-    """Primitives stand for the collision meshes: after 200 actions on the floor the angles differ by 0.07 and 0.005."""
-    for name in ("ep0", "ep2"):
+    """A sphere and a capsule stand for the meshes: 0.016 and 0.005 rad at most in 200 actions on the floor."""
+    for name, limit in (("ep0", 0.02), ("ep2", 0.006)):
         episode = load("UR5Reacher")[name]
         env = make("UR5Reacher", "compact")
         observation, _ = env.reset(options=start_of(episode))
-        for action in episode["action"][:200]:
+        for t, action in enumerate(episode["action"][:200]):
             observation = env.step(action)[0]
-        error = np.abs(observation["observation"][:3] - episode["observation"][200][:3])
-        assert error.max() < {"ep0": 0.1, "ep2": 0.02}[name]
+            error = np.abs(observation["observation"][:3] - episode["observation"][t + 1][:3])
+            assert error.max() < limit, (name, t)
+
+
+def test_ur5_folds_only_as_far_as_its_shoulder():
+    """The forearm bumps into the shoulder and does not pass through it."""
+    env = make("UR5Reacher", "compact")
+    env.reset(options={"state": {"qpos": [0.0, -1.0, 0.0], "qvel": [0.0, 0.0, 0.0]}})
+    for _ in range(300):
+        env.step(np.array([0.0, -1.9, -3.15]))
+    assert -2.95 < env.unwrapped.task_state()["qpos"][2] < -2.5
 
 
 def test_default_differs_from_legacy_only_where_documented():
