@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from importlib.resources import files
 
 import numpy as np
@@ -28,7 +29,7 @@ def to_c(policy: ExportedPolicy) -> str:
         "REACHED": _reached(policy),
         "HIGH_INPUTS": _high_inputs(policy),
         "FORGET": {"window": "over", "episode": "started", "none": "1"}[policy.memory],
-        "ASKED": "state->subgoal[i] - here[i]" if policy.relative_subgoals else "state->subgoal[i]",
+        "ASKED": "(state->subgoal[i] - here[i])" if policy.relative_subgoals else "state->subgoal[i]",
         "UNITS": str(policy.subgoal_dim + (policy.fixed_budget is None)),
         "BUDGET": _CHOSEN if policy.fixed_budget is None else repr(policy.fixed_budget),
         "REMAINING": _REMAINING if policy.remaining_time else "",
@@ -68,19 +69,27 @@ def array(name: str, values: FloatArray) -> str:
     return f"static const float {name}[{max(1, np.size(values))}] = {{{floats(values) or '0.0f'}}};\n"
 
 
+def exact(name: str, values: FloatArray) -> str:
+    """A constant array of products, which single precision would round."""
+    listed = ", ".join(repr(float(v)) for v in np.asarray(values, np.float64).ravel())
+    return f"static const tbc_real {name}[{max(1, np.size(values))}] = {{{listed or '0.0'}}};\n"
+
+
 def _indices(name: str, values: NDArray[np.integer]) -> str:
     kind = "unsigned char" if values.max(initial=0) < 256 else "unsigned short"
     listed = ", ".join(str(int(v)) for v in values) or "0"
     return f"static const {kind} {name}[{max(1, len(values))}] = {{{listed}}};\n"
 
 
-def _sparse(name: str, matrix: FloatArray, columns: dict[str, FloatArray]) -> str:
+def _sparse(
+    name: str, matrix: FloatArray, columns: dict[str, FloatArray], write: Callable[[str, FloatArray], str] = array
+) -> str:
     """Compressed rows by postsynaptic neuron: where rows begin, presynaptic indices, and one array per column set."""
     present = matrix.T != 0
     post, pre = np.nonzero(present)
     begin = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
     text = _indices(f"{name}_begin", begin) + _indices(f"{name}_pre", pre)
-    return text + "".join(array(f"{name}_{column}", values[pre, post]) for column, values in columns.items())
+    return text + "".join(write(f"{name}_{column}", values[pre, post]) for column, values in columns.items())
 
 
 def _circuit(c: Circuit) -> str:
@@ -90,12 +99,13 @@ def _circuit(c: Circuit) -> str:
     sizes = {"SENSORY": inputs, "INTER": inter, "PRESYNAPTIC": len(c.gain), "SUB_STEPS": c.sub_steps}
     text = "".join(f"#define TBC_{name} {size}\n" for name, size in sizes.items())
     text += _indices("layer_end", ends)
-    text += array("sensory_gain", c.sensory_gain * c.input_gain) + array("sensory_threshold", c.sensory_threshold)
+    input_gain = c.input_gain.astype(np.float64)
+    text += exact("sensory_gain", c.sensory_gain * input_gain) + array("sensory_threshold", c.sensory_threshold)
     text += array("gain", c.gain) + array("threshold", c.threshold)
     text += array("rest_weighted", c.rest[:n]) + array("rest_total", c.rest[n:])
     text += array("capacitance", c.capacitance) + array("current_bias", c.current_bias)
     text += array("input_conductance", currents[np.arange(inter), np.arange(inter)])
-    text += _sparse("current", c.current_weight, {"weight": c.current_weight * c.input_gain[:, None]})
+    text += _sparse("current", c.current_weight, {"weight": c.current_weight * input_gain[:, None]}, exact)
     text += _sparse("sensory", sensory[:, n:], {"weighted": sensory[:, :n], "total": sensory[:, n:]})
     text += _sparse("recurrent", c.recurrent[:, n:], {"weighted": c.recurrent[:, :n], "total": c.recurrent[:, n:]})
     return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
@@ -118,29 +128,35 @@ void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT]
 
 def _mlp(name: str, mlp: MLP) -> str:
     """Weights and one function ``<name>_network(x, y)``."""
-    text, code, source = "", "", "x"
+    text, code, source = "", "", "in"
     last = len(mlp.weights) - 1
+    n_in, n_out = len(mlp.weights[0]), len(mlp.biases[-1])
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
         inputs, outputs = weight.shape
         text += array(f"{name}_w{i}", weight.T) + array(f"{name}_b{i}", bias)
-        target = "y" if i == last else f"h{i}"
+        target = f"h{i}"
         activation = "linear" if i == last else mlp.activation
-        code += f"    float h{i}[{outputs}];\n" if i < last else ""
+        code += f"    tbc_real h{i}[{outputs}];\n"
         code += f"    dense_{activation}({inputs}, {outputs}, {name}_w{i}, {name}_b{i}, {source}, {target});\n"
         source = target
-    declared = "".join(line + "\n" for line in code.splitlines() if line.startswith("    float"))
-    called = "".join(line + "\n" for line in code.splitlines() if not line.startswith("    float"))
+    declared = "".join(line + "\n" for line in code.splitlines() if line.startswith("    tbc_real"))
+    called = "".join(line + "\n" for line in code.splitlines() if not line.startswith("    tbc_real"))
     used = {mlp.activation, "linear"} if last else {"linear"}
     dense = "".join(
         _DENSE.replace("@KIND@", k).replace("@RULE@", _RULES[k]).replace("@NAME@", name) for k in sorted(used)
     )
     called = re.sub(r"dense_", f"{name}_dense_", called)
-    return f"{text}\n{dense}\nstatic void {name}_network(const float *x, float *y)\n{{\n{declared}{called}}}\n"
+    declared = f"    tbc_real in[{n_in}];\n{declared}    int i;\n"
+    read = f"    for (i = 0; i < {n_in}; ++i) {{\n        in[i] = x[i];\n    }}\n"
+    written = f"    for (i = 0; i < {n_out}; ++i) {{\n        y[i] = (float){source}[i];\n    }}\n"
+    body = declared + read + called + written
+    return f"{text}\n{dense}\nstatic void {name}_network(const float *x, float *y)\n{{\n{body}}}\n"
 
 
 _RULES = {"linear": "sum", "relu": "(sum > 0 ? sum : 0)", "tanh": "TBC_TANH(sum)"}
 _DENSE = """
-static void @NAME@_dense_@KIND@(int inputs, int outputs, const float *w, const float *b, const float *x, float *y)
+static void @NAME@_dense_@KIND@(int inputs, int outputs, const float *w, const float *b, const tbc_real *x,
+                                tbc_real *y)
 {
     int i, j;
     for (j = 0; j < outputs; ++j) {
@@ -148,7 +164,7 @@ static void @NAME@_dense_@KIND@(int inputs, int outputs, const float *w, const f
         for (i = 0; i < inputs; ++i) {
             sum += w[j * inputs + i] * x[i];
         }
-        y[j] = (float)@RULE@;
+        y[j] = @RULE@;
     }
 }
 """
@@ -171,13 +187,13 @@ def _option_data(policy: ExportedPolicy) -> str:
 
 def _coordinate(index: int, c: Coordinate) -> str:
     if c.kind == "angle":
-        return f"    here[{index}] = atan2f(entries[{c.first}], entries[{c.second}]);"
+        return f"    here[{index}] = (tbc_real)atan2(entries[{c.first}], entries[{c.second}]);"
     if c.kind == "wrap":
-        return f"    here[{index}] = fmodf(entries[{c.first}], {floats(np.array(c.high))});"
+        return f"    here[{index}] = (tbc_real)fmod(entries[{c.first}], {c.high!r});"
     value = f"entries[{c.first}]"
-    value = f"fminf({value}, {floats(np.array(c.high))})" if np.isfinite(c.high) else value
-    value = f"fmaxf({value}, {floats(np.array(c.low))})" if np.isfinite(c.low) else value
-    return f"    here[{index}] = {value};"
+    value = f"fmin({value}, {c.high!r})" if np.isfinite(c.high) else value
+    value = f"fmax({value}, {c.low!r})" if np.isfinite(c.low) else value
+    return f"    here[{index}] = (tbc_real){value};"
 
 
 def _reached(policy: ExportedPolicy) -> str:
@@ -186,7 +202,7 @@ def _reached(policy: ExportedPolicy) -> str:
     tests = []
     for group, threshold in zip(policy.groups, policy.thresholds, strict=True):
         squares = " + ".join(f"(here[{i}] - subgoal[{i}]) * (here[{i}] - subgoal[{i}])" for i in group)
-        tests.append(f"sqrtf({squares}) < {floats(np.array(threshold))}")
+        tests.append(f"sqrt({squares}) < {float(threshold)!r}")
     return "    return " + "\n        && ".join(tests) + ";"
 
 

@@ -17,7 +17,7 @@ Array = NDArray[Any]
 State = dict[str, Any]
 ARRAYS: dict[str, Array] = dict(np.load(io.BytesIO(base64.b64decode(WEIGHTS)))) if WEIGHTS else {}
 for _name in ARRAYS:
-    if _name.startswith("low.") and SETTINGS["low.kind"] == "circuit":
+    if _name.startswith(("high.", "low.")):
         ARRAYS[_name] = ARRAYS[_name].astype(np.float64)  # as the agent itself acts
 CLOSED_FORM = False
 """Set to True to take the circuit's closed form instead of its sub-steps."""
@@ -35,6 +35,9 @@ def initial_state() -> State:
 
 def step(observation: Array, achieved_goal: Array, desired_goal: Array, state: State) -> tuple[Array, State]:
     """One control step: the action in the environment's units, and the next state."""
+    observation, achieved_goal, desired_goal = (
+        np.asarray(part, np.float32).astype(np.float64) for part in (observation, achieved_goal, desired_goal)
+    )
     entries = np.concatenate([observation, achieved_goal])
     state = dict(state)
     started = state["elapsed"] < 0
@@ -58,8 +61,8 @@ def step(observation: Array, achieved_goal: Array, desired_goal: Array, state: S
         mean = (potentials @ ARRAYS["low.readout"] + ARRAYS["low.readout_bias"]).astype(np.float32)
         state["membrane"] = potentials.astype(np.float32)
     state["elapsed"] += 1
-    low, high = ARRAYS["action_low"], ARRAYS["action_high"]
-    return np.asarray(low + 0.5 * (_squash(mean, 1) + 1.0) * (high - low)), state
+    low, high = ARRAYS["action_low"].astype(np.float32), ARRAYS["action_high"].astype(np.float32)
+    return np.asarray(low + np.float32(0.5) * (_squash(mean, 1) + np.float32(1.0)) * (high - low)), state
 
 
 def _begin(observation: Array, achieved_goal: Array, desired_goal: Array, state: State) -> None:
@@ -93,16 +96,17 @@ def _reached(difference: Array) -> bool:
 
 def _squash(mean: Array, level: int) -> Array:
     bound = SETTINGS["mean_bounds"][level]
-    return np.asarray(np.tanh(np.clip(mean, -bound, bound)))
+    return np.asarray(np.tanh(np.clip(mean, -bound, bound), dtype=np.float64).astype(np.float32))
 
 
 def _mlp(level: str, x: Array) -> Array:
+    x = x.astype(np.float64)
     count = SETTINGS[level + ".weights.count"]
     for i in range(count):
         x = x @ ARRAYS[f"{level}.weights.{i}"] + ARRAYS[f"{level}.biases.{i}"]
         if i < count - 1:
             x = np.maximum(x, 0.0) if SETTINGS[level + ".activation"] == "relu" else np.tanh(x)
-    return x
+    return x.astype(np.float32)
 
 
 def _logistic(x: Array) -> Array:

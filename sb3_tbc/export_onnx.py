@@ -51,18 +51,22 @@ class _Graph:
     def cast(self, x: str, kind: int, name: str | None = None) -> str:
         return self("Cast", x, name=name, to=kind)
 
+    def single(self, x: str) -> str:
+        """Double precision, rounded to single."""
+        return self.cast(self.cast(x, TensorProto.FLOAT), TensorProto.DOUBLE)
+
 
 def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
     """A graph from (observation, achieved_goal, desired_goal, state) to (action, next state).
 
-    State tensors are ``subgoal`` (task units), ``time_budget`` and ``elapsed`` (control steps, float64; ``elapsed`` is
-    -1 before the first option) and ``membrane``; the next ones are called ``next_<name>``. Start an episode with
-    elapsed -1 and zeros elsewhere.
+    State tensors are ``subgoal`` (task units), ``time_budget`` and ``elapsed`` (control steps; ``elapsed`` is -1 before
+    the first option), all three float64, and ``membrane``, float32; the next ones are called ``next_<name>``. Start an
+    episode with elapsed -1 and zeros elsewhere. Inside, all arithmetic is double, rounded where the agent rounds.
 
     :param policy: what to export
     """
     g = _Graph()
-    entries = g.join("observation", "achieved_goal")
+    entries = g.cast(g.join("observation", "achieved_goal"), TensorProto.DOUBLE)
     here = g.join(*(_coordinate(g, entries, c) for c in policy.achieved)) if policy.achieved else None
     zero = g.constant(0.0, np.float64)
     started = g("Less", "elapsed", zero)
@@ -76,27 +80,30 @@ def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
     elapsed = g("Where", over, zero, "elapsed")
     asked = g("Sub", subgoal, here) if policy.relative_subgoals and here else subgoal
     left = g("Div", g("Sub", budget, elapsed), g.constant(policy.dt_max, np.float64))
-    remaining = g.cast(g("Clip", left, zero, g.constant(1.0, np.float64)), TensorProto.FLOAT)
-    seen = g.join(g.columns(entries, policy.local), asked, *([remaining] if policy.remaining_time else []))
+    remaining = g("Clip", left, zero, g.constant(1.0, np.float64))
+    exact = g.join(g.columns(entries, policy.local), asked, *([remaining] if policy.remaining_time else []))
+    seen = g.single(exact)
     mean = _low(g, policy, seen, over, started)
-    unit = _squash(g, mean, policy.mean_bounds[1])
-    half = 0.5 * (policy.action_high - policy.action_low)
-    g("Add", g("Mul", unit, g.constant(half)), g.constant(policy.action_low + half), name="action")
+    unit = g.cast(_squash(g, mean, policy.mean_bounds[1]), TensorProto.FLOAT)
+    share = g("Mul", g("Add", unit, g.constant(1.0)), g.constant(0.5))
+    scaled = g("Mul", share, g.constant(policy.action_high.astype(np.float32) - policy.action_low.astype(np.float32)))
+    g("Add", g.constant(policy.action_low), scaled, name="action")
     g("Add", elapsed, g.constant(1.0, np.float64), name="next_elapsed")
     return _model(g, policy)
 
 
 def _high(g: _Graph, policy: ExportedPolicy) -> tuple[str, str]:
-    """What the high level would choose now: subgoal, and time budget in float64."""
+    """What the high level would choose now: subgoal and time budget."""
     parts = ["desired_goal", "observation"] + ([] if policy.achieved_in_observation else ["achieved_goal"])
-    unit = _squash(g, _mlp(g, policy.high, g.join(*parts)), policy.mean_bounds[0])
+    seen = g.cast(g.join(*parts), TensorProto.DOUBLE)
+    unit = _squash(g, _mlp(g, policy.high, seen), policy.mean_bounds[0])
     d = policy.subgoal_dim
     half = 0.5 * (policy.subgoal_high - policy.subgoal_low)
-    subgoal = g.affine(g.slice(unit, 0, d), half, policy.subgoal_low + half)
+    subgoal = g.affine(g.slice(unit, 0, d), half, policy.subgoal_low + half, np.float64)
     if policy.fixed_budget is not None:
         return subgoal, g.constant([[policy.fixed_budget]], np.float64)
     span = 0.5 * (policy.dt_max - policy.dt_min)
-    budget = g.affine(g.cast(g.slice(unit, d, d + 1), TensorProto.DOUBLE), span, policy.dt_min + span, np.float64)
+    budget = g.affine(g.slice(unit, d, d + 1), span, policy.dt_min + span, np.float64)
     return subgoal, budget
 
 
@@ -104,16 +111,16 @@ def _low(g: _Graph, policy: ExportedPolicy, seen: str, over: str, started: str) 
     """The low level's mean; the circuit's next potentials are named on the way."""
     if isinstance(policy.low, MLP):
         return _mlp(g, policy.low, seen)
-    zeros = g.constant(np.zeros((1, policy.state_dim)))
+    zeros = g.constant(np.zeros((1, policy.state_dim)))  # the potentials are kept in single precision
     if policy.memory == "none":
         membrane = g("Mul", "membrane", zeros)
     else:
         membrane = g("Where", over if policy.memory == "window" else started, zeros, "membrane")
-    seen, membrane = (g.cast(x, TensorProto.DOUBLE) for x in (seen, membrane))
+    membrane = g.cast(membrane, TensorProto.DOUBLE)
     potentials = _circuit(g, policy.low, seen, membrane)
     g.cast(potentials, TensorProto.FLOAT, name="next_membrane")
     readout, bias = (g.constant(x, np.float64) for x in (policy.low.readout, policy.low.readout_bias))
-    return g.cast(g("Add", g("MatMul", potentials, readout), bias), TensorProto.FLOAT)
+    return g.single(g("Add", g("MatMul", potentials, readout), bias))
 
 
 def _circuit(g: _Graph, c: Circuit, seen: str, potentials: str) -> str:
@@ -145,24 +152,27 @@ def _logistic(g: _Graph, x: str) -> str:
 
 def _mlp(g: _Graph, mlp: MLP, x: str) -> str:
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
-        x = g("Add", g("MatMul", x, g.constant(weight)), g.constant(bias))
+        x = g("Add", g("MatMul", x, g.constant(weight, np.float64)), g.constant(bias, np.float64))
         if i < len(mlp.weights) - 1:
             x = g({"relu": "Relu", "tanh": "Tanh"}[mlp.activation], x)
-    return x
+    return g.single(x)
 
 
 def _squash(g: _Graph, mean: str, bound: float) -> str:
-    return g("Tanh", g("Clip", mean, g.constant(-bound), g.constant(bound)) if np.isfinite(bound) else mean)
+    wide = np.float64
+    bounded = g("Clip", mean, g.constant(-bound, wide), g.constant(bound, wide)) if np.isfinite(bound) else mean
+    return g.single(g("Tanh", bounded))
 
 
 def _coordinate(g: _Graph, entries: str, c: Coordinate) -> str:
     value = g.columns(entries, [c.first])
     if c.kind == "wrap":
-        return g("Mod", value, g.constant(c.high), fmod=1)
-    if c.kind == "angle":
-        return _angle(g, value, g.columns(entries, [c.second]))
-    value = g("Max", value, g.constant(c.low)) if np.isfinite(c.low) else value
-    return g("Min", value, g.constant(c.high)) if np.isfinite(c.high) else value
+        return g("Mod", value, g.constant(c.high, np.float64), fmod=1)
+    if c.kind == "angle":  # onnxruntime has no arctangent in double precision
+        y, x = (g.cast(part, TensorProto.FLOAT) for part in (value, g.columns(entries, [c.second])))
+        return g.cast(_angle(g, y, x), TensorProto.DOUBLE)
+    value = g("Max", value, g.constant(c.low, np.float64)) if np.isfinite(c.low) else value
+    return g("Min", value, g.constant(c.high, np.float64)) if np.isfinite(c.high) else value
 
 
 def _angle(g: _Graph, y: str, x: str) -> str:
@@ -182,8 +192,8 @@ def _reached(g: _Graph, policy: ExportedPolicy, here: str) -> str:
     for column, group in enumerate(policy.groups):
         member[list(group), column] = 1.0
     difference = g("Sub", here, "subgoal")
-    distances = g("Sqrt", g("MatMul", g("Mul", difference, difference), g.constant(member)))
-    within = g.cast(g("Less", distances, g.constant(policy.thresholds)), TensorProto.FLOAT)
+    distances = g("Sqrt", g("MatMul", g("Mul", difference, difference), g.constant(member, np.float64)))
+    within = g.cast(g("Less", distances, g.constant(policy.thresholds, np.float64)), TensorProto.FLOAT)
     return g("Greater", g("ReduceMin", within, axes=[1], keepdims=1), g.constant(0.5))
 
 
@@ -197,7 +207,7 @@ def _model(g: _Graph, policy: ExportedPolicy) -> onnx.ModelProto:
     state = {"subgoal": policy.subgoal_dim, "time_budget": 1, "elapsed": 1, "membrane": policy.state_dim}
     for name, width in state.items():
         if width:
-            kind = TensorProto.DOUBLE if name in ("time_budget", "elapsed") else TensorProto.FLOAT
+            kind = TensorProto.FLOAT if name == "membrane" else TensorProto.DOUBLE
             inputs.append(tensor(name, width, kind))
             outputs.append(tensor(f"next_{name}", width, kind))
     graph = helper.make_graph(g.nodes, policy.task, inputs, outputs, list(g.constants.values()))

@@ -10,6 +10,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 
 import sb3_tbc.export
 from sb3_tbc import TBCHRL
@@ -59,6 +60,37 @@ def test_it_acts_as_predict_does_over_a_thousand_steps(case: str, kind: str, tmp
     result = compare(model, player, env, 1000)
     assert result.max_difference < 1e-5
     assert result.windows >= 20
+
+
+def trained_look(model: TBCHRL, seed: int = 0) -> TBCHRL:
+    """Weights as training leaves them: large, some neurons almost without inertia, some logistics almost steps."""
+    generator = th.Generator().manual_seed(seed)
+    for level in (model.high, model.low):
+        with th.no_grad():
+            for name, p in level.policy.average_actor.named_parameters():
+                p.mul_(4.0 if level is model.high else 3.0).add_(0.3 * th.randn(p.shape, generator=generator))
+                if name.endswith("raw_capacitance"):
+                    p[::2] = -13.8  # a capacitance of 1e-6
+                if name.endswith("raw_gain"):
+                    p[::2] = 12.0
+        level.refresh()
+    return model
+
+
+@pytest.mark.parametrize("kind", ["numpy", "onnx", pytest.param("c", marks=needs_cc)])
+@pytest.mark.parametrize("case", ["reached", "relative", "mlp", "memoryless"])
+def test_large_weights_do_not_part_them(case: str, kind: str, tmp_path: Path) -> None:
+    if kind == "onnx":
+        pytest.importorskip("onnxruntime")
+    model, env = make(case)
+    policy, path = extract(trained_look(model), case), tmp_path / f"policy{sb3_tbc.export.SUFFIXES[kind]}"
+    sb3_tbc.export.WRITERS[kind](policy, path)
+    player = {"numpy": NumpyPlayer, "onnx": OnnxPlayer}[kind](path) if kind != "c" else CPlayer(path, policy)
+    for seed in range(3):
+        player.reset()
+        result = compare(model, player, env, 300, seed)
+        assert result.max_difference < 1e-5
+        assert result.windows >= 3
 
 
 def test_an_onnx_graph_takes_a_batch(pendulum: tuple[TBCHRL, ExportedPolicy], tmp_path: Path) -> None:

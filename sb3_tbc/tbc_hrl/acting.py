@@ -47,22 +47,26 @@ class FrozenNet(Protocol):
 
 
 class FrozenMLP:
-    """NumPy forward pass of an MLP actor; its arrays share memory with the parameters, so it is never stale.
+    """NumPy forward pass of an MLP actor.
 
+    In single precision its arrays share memory with the parameters, so it is never stale.
+
+    :param actor: the actor
+    :param dtype: precision of the arithmetic; inputs and outputs are float32
     :raises ValueError: for an activation function without a NumPy counterpart
     """
 
-    def __init__(self, actor: MLPActor) -> None:
+    def __init__(self, actor: MLPActor, dtype: type[np.floating[Any]] = np.float32) -> None:
         if actor.activation_fn not in ACTIVATIONS:
             allowed = sorted(f.__name__ for f in ACTIVATIONS)
             raise ValueError(f"activation_fn must be one of {allowed} to act in NumPy, got {actor.activation_fn}")
-        self._actor = actor
+        self._actor, self._dtype = actor, dtype
         self._activation = ACTIVATIONS[actor.activation_fn]
         self.refresh()
 
     def refresh(self) -> None:
-        """Point the arrays at the parameters again."""
-        arrays = [_as_array(block) for block in self._actor.blocks()]
+        """Point the arrays at the parameters again, or copy them in another precision."""
+        arrays = [_as_array(block).astype(self._dtype, copy=False) for block in self._actor.blocks()]
         self._hidden = [(w.T, b) for w, b in zip(arrays[:-2:2], arrays[1:-2:2], strict=True)]
         self._out_weight, self._out_bias = arrays[-2].T, arrays[-1]
 
@@ -74,7 +78,8 @@ class FrozenMLP:
             x = np.dot(x, weight)
             x += bias
             x = activation(x)
-        return np.dot(x, self._out_weight) + self._out_bias, states
+        outputs = np.dot(x, self._out_weight) + self._out_bias
+        return outputs.astype(np.float32, copy=False), states
 
 
 def _as_array(block: Block) -> FloatArray:
@@ -89,17 +94,23 @@ def _as_array(block: Block) -> FloatArray:
     return first.as_strided(block.shape, strides).numpy()
 
 
-def freeze(actor: MLPActor | NDBCActor) -> FrozenNet:
-    """NumPy forward pass of an actor whose parameters lie in flat storage."""
+def freeze(actor: MLPActor | NDBCActor, dtype: type[np.floating[Any]] = np.float32) -> FrozenNet:
+    """NumPy forward pass of an actor whose parameters lie in flat storage.
+
+    :param dtype: precision of an MLP's arithmetic; a circuit's is double in any case
+    """
     if isinstance(actor, NDBCActor):
         from sb3_tbc.ndbc.frozen import FrozenNDBC
 
         return FrozenNDBC(actor.net)
-    return FrozenMLP(actor)
+    return FrozenMLP(actor, dtype)
 
 
 class FrozenActor:
     """Acts in NumPy from an actor's weights, which it reads again when the policy's ``weights_version`` has changed.
+
+    The averaged actor, which is what gets deployed, acts in double precision inside: what it is given and what it
+    returns is rounded to single precision, and an exported policy that does the same gives the same actions.
 
     :param policy: policy of a level, its parameters in flat storage
     :param average: act from the averaged actor
@@ -109,7 +120,8 @@ class FrozenActor:
         actor = policy.average_actor if average else policy.actor
         self._policy = policy
         self._version = policy.weights_version
-        self._net = freeze(actor)
+        self._dtype = np.float64 if average else np.float32
+        self._net = freeze(actor, self._dtype)
         head: GaussianHead = actor.head
         self._mean_bound = head.mean_bound
         self._low, self._high = head.log_std_bounds
@@ -135,7 +147,7 @@ class FrozenActor:
             std *= rng.standard_normal(mean.shape, dtype=np.float32)
             std += mean
             mean = std
-        return np.tanh(mean), next_states
+        return np.tanh(mean, dtype=self._dtype).astype(np.float32, copy=False), next_states
 
     def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
         """States ``(n, state_dim)`` after a step with these observations."""

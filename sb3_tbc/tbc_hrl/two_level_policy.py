@@ -130,7 +130,8 @@ class TBCPolicy(BasePolicy):
         if not isinstance(observation, dict) or any(key not in observation for key in GOAL_KEYS):
             found = sorted(observation) if isinstance(observation, dict) else type(observation).__name__
             raise ValueError(f"predict needs a goal observation with the keys {sorted(GOAL_KEYS)}, got {found}")
-        batch = {key: np.asarray(observation[key]) for key in GOAL_KEYS}
+        single_precision = {key: np.asarray(observation[key], dtype=np.float32) for key in GOAL_KEYS}
+        batch = {key: part.astype(np.float64) for key, part in single_precision.items()}  # as exported policies see it
         single = batch["observation"].ndim == 1
         return ({key: part[None] for key, part in batch.items()} if single else batch), single
 

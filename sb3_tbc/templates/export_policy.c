@@ -7,16 +7,22 @@
  *
  * The fifth argument chooses how the circuit is evaluated: 0 integrates its sub-steps as in training, 1 takes the closed
  * form. To use the functions from another file, define TBC_DECLARATIONS_ONLY there and include this one.
- * TBC_LOW_LEVEL_ONLY leaves out the high level. The circuit works in double precision, as predict does; define
- * TBC_SINGLE for processors that have single precision only, at the price of the fourth digit of an action.
+ * TBC_LOW_LEVEL_ONLY leaves out the high level. Both levels work in double precision, as predict does; define TBC_SINGLE
+ * everywhere for processors that have single precision only, at the price of the fourth digit of an action.
  */
 #ifndef TBC_POLICY
 #define TBC_POLICY
 
 @SIZES@
 
+#ifdef TBC_SINGLE
+typedef float tbc_real;
+#else
+typedef double tbc_real;
+#endif
+
 typedef struct {
-    float subgoal[TBC_SUBGOAL];       /* task units */
+    tbc_real subgoal[TBC_SUBGOAL];    /* task units */
     double time_budget;               /* control steps */
     int elapsed;                      /* control steps since the option began; -1: no option yet */
     float membrane[TBC_STATE + 1];    /* potentials; the last entry is unused */
@@ -40,12 +46,10 @@ void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT]
 #include <string.h>
 
 #ifdef TBC_SINGLE
-typedef float tbc_real;
 #define TBC_EXP expf
 #define TBC_EXPM1 expm1f
 #define TBC_TANH tanhf
 #else
-typedef double tbc_real;
 #define TBC_EXP exp
 #define TBC_EXPM1 expm1
 #define TBC_TANH tanh
@@ -65,13 +69,13 @@ static tbc_real squash(float mean, float bound)
 }
 
 /* Subgoal-space point of a state; only filled in where options may end on reaching their subgoal. */
-static void subgoal_point(const float *entries, float here[TBC_SUBGOAL])
+static void subgoal_point(const float *entries, tbc_real here[TBC_SUBGOAL])
 {
-    memset(here, 0, TBC_SUBGOAL * sizeof(float));
+    memset(here, 0, TBC_SUBGOAL * sizeof(tbc_real));
 @ACHIEVED@
 }
 
-static int reached(const float *here, const float *subgoal)
+static int reached(const tbc_real *here, const tbc_real *subgoal)
 {
 @REACHED@
 }
@@ -85,7 +89,7 @@ static void begin_option(tbc_state *state, const float *observation, const float
     high_network(seen, unit);
     for (i = 0; i < TBC_SUBGOAL; ++i) {
         const double half = 0.5 * ((double)(float)squash(unit[i], TBC_HIGH_BOUND) + 1.0);
-        state->subgoal[i] = (float)(subgoal_low[i] + half * (subgoal_high[i] - subgoal_low[i]));
+        state->subgoal[i] = (tbc_real)(subgoal_low[i] + half * (subgoal_high[i] - subgoal_low[i]));
     }
     state->time_budget = @BUDGET@;
     state->elapsed = 0;
@@ -101,7 +105,8 @@ void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
               const float achieved_goal[TBC_ACHIEVED_GOAL], const float desired_goal[TBC_DESIRED_GOAL],
               int closed_form, float action[TBC_ACTION])
 {
-    float entries[TBC_OBSERVATION + TBC_ACHIEVED_GOAL], here[TBC_SUBGOAL], seen[TBC_LOW_INPUT], mean[TBC_ACTION];
+    float entries[TBC_OBSERVATION + TBC_ACHIEVED_GOAL], seen[TBC_LOW_INPUT], mean[TBC_ACTION];
+    tbc_real here[TBC_SUBGOAL];
     const int n_local = @LOCAL@;
     const int started = state->elapsed < 0;
     int i, over;
@@ -121,7 +126,7 @@ void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
         seen[i] = entries[local_entry[i]];
     }
     for (i = 0; i < TBC_SUBGOAL; ++i) {
-        seen[n_local + i] = @ASKED@;
+        seen[n_local + i] = (float)@ASKED@;
     }@REMAINING@
     tbc_low_mean(state->membrane, seen, closed_form, mean);
     for (i = 0; i < TBC_ACTION; ++i) {
