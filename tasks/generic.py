@@ -307,14 +307,14 @@ def _tolerances(
     best = float(compute(goal, goal.copy(), {}))
     for i, half in enumerate(0.5 * (high - low)):
         inside, outside = 0.0, float(half)
-        for _ in range(20):
+        for _ in range(40):
             middle = 0.5 * (inside + outside)
             point = goal.copy()
             point[i] += middle
             inside, outside = (middle, outside) if float(compute(point, goal, {})) == best else (inside, middle)
         if not 1e-3 * half < inside < 0.999 * half:  # a dense reward falls at once, a coordinate without say never
             return None
-        tolerances[i] = inside
+        tolerances[i] = float(f"{inside:.6g}")
     return tolerances
 
 

@@ -124,6 +124,36 @@ def test_distance_threshold_is_euclidean():
     assert one.groups == ((0, 1),)
 
 
+class Boxed(Point):
+    """Coordinates count one by one, the second not at all if ``slack`` is infinite."""
+
+    slack = 0.5
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return np.where((np.abs(achieved_goal - desired_goal) < [0.3, self.slack]).all(axis=-1), 0.0, -1.0)
+
+
+class Dense(Point):
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return -np.linalg.norm(achieved_goal - desired_goal, axis=-1)
+
+
+def test_thresholds_come_from_rewards_where_nothing_is_declared():
+    subgoals = describe_goal_env(Point(bound=4.0)).subgoals
+    assert subgoals.groups == ((0, 1),)
+    np.testing.assert_array_equal(subgoals.thresholds, [0.3])
+    subgoals = describe_goal_env(Boxed(bound=4.0)).subgoals
+    assert subgoals.groups == ((0,), (1,))
+    np.testing.assert_array_equal(subgoals.thresholds, [0.3, 0.5])
+    same = Boxed(bound=4.0)
+    same.slack = 0.3
+    assert describe_goal_env(same).subgoals.groups == ((0,), (1,))
+    blind = Boxed(bound=4.0)
+    blind.slack = np.inf
+    for env in (blind, Dense(bound=4.0)):  # rewards that do not tell: 5 % of each range
+        np.testing.assert_allclose(describe_goal_env(env).subgoals.thresholds, [0.4, 0.4])
+
+
 def test_low_level_sees_the_achieved_goal():
     inside, hidden = describe_goal_env(Point()), describe_goal_env(Point(hidden=True))
     assert inside.achieved_in_observation
@@ -186,6 +216,7 @@ def test_a_maze_of_gymnasium_robotics():
     gym.register_envs(gymnasium_robotics)
     env = DescribedGoalEnv(gym.make("PointMaze_UMaze-v3"), n_probe_steps=400)
     assert env.subgoals.dim == 2
+    np.testing.assert_allclose(env.subgoals.thresholds, [0.45])
     assert env.achieved_in_observation
     assert env.max_episode_steps == 300
     env.reset(seed=0)
