@@ -15,7 +15,7 @@ from sb3_tbc.zoo.ledger import to_json
 def build_parser() -> Parser:
     """The command's arguments, one sub-command per thing to measure."""
     parser = Parser(prog="sb3_tbc.benchmark", description="Timings, one torch thread; ratios within a run count.")
-    commands = parser.add_subparsers(dest="what", required=True, parser_class=Parser)
+    commands = parser.add_subparsers(dest="subject", required=True, parser_class=Parser)
     cells = commands.add_parser("cells", help="NDBCNet beside LTC, CfC and GRU: sequences, single steps, growth")
     cells.add_argument("--rounds", type=positive_int, default=20, help="rounds over all cells")
     cells.add_argument("--batch", type=positive_int, default=256)
@@ -25,6 +25,13 @@ def build_parser() -> Parser:
     cells.add_argument("--json", metavar="OUT", help="write the figures here too")
     parameters = commands.add_parser("parameters", help="parameter counts of table A1's circuits beside their MLPs")
     parameters.add_argument("--json", metavar="OUT", help="write the figures here too")
+    train = commands.add_parser("train", help="training speed beside SB3's SAC and SBX's, and where the time goes")
+    train.add_argument("tasks", nargs="*", default=["Pendulum", "Drawbridge"], metavar="TASK")
+    train.add_argument("--what", nargs="+", default=["speed", "split", "update"], metavar="WHAT",
+                       help="of speed, split, update, growth, n-envs, memory, budget")  # fmt: skip
+    train.add_argument("--steps", type=positive_int, default=2000, help="environment steps of a stretch of learning")
+    train.add_argument("--rounds", type=positive_int, default=5, help="stretches of each contender, in turns")
+    train.add_argument("--json", metavar="OUT", help="write the figures here too")
     return parser
 
 
@@ -41,8 +48,12 @@ def benchmark(argv: Sequence[str]) -> int:
 def _measure(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
     from sb3_tbc import benchmark_cells
 
-    if arguments.what == "cells":
+    if arguments.subject == "cells":
         return benchmark_cells.cells(arguments)
+    if arguments.subject == "train":
+        from sb3_tbc import benchmark_train
+
+        return benchmark_train.train(arguments)
     return benchmark_cells.parameters()
 
 

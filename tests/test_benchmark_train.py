@@ -1,0 +1,77 @@
+"""The training benchmark: it runs, its parts add up, and it leaves nothing behind."""
+
+import json
+import time
+
+import numpy as np
+import pytest
+
+from sb3_tbc import benchmark_train
+from sb3_tbc.benchmark import benchmark
+from sb3_tbc.benchmark_profile import OUTSIDE, PARTS, Stopwatch, profile
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.tbc_hrl.collection import Collector
+from sb3_tbc.tbc_hrl.level import SACLevel
+from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
+
+
+@pytest.fixture(autouse=True)
+def eager(monkeypatch):
+    """Neither compile nor move the test process to one core."""
+    monkeypatch.setattr(benchmark_train, "compiler_problem", lambda: "not in tests")
+    monkeypatch.setattr(benchmark_train, "one_core", lambda: None)
+
+
+def test_command_prints_and_writes_json(tmp_path, capsys):
+    arguments = ["train", "Drawbridge", "--steps", "60", "--rounds", "1", "--json", str(tmp_path / "out.json")]
+    assert benchmark(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "SB3 SAC" in printed
+    assert "microseconds per step" in printed
+    figures = json.loads((tmp_path / "out.json").read_text())
+    assert set(figures) == {"update", "speed Drawbridge", "split Drawbridge"}
+    assert figures["speed Drawbridge"]["SB3 SAC"]["times_sb3"] == pytest.approx(1.0)
+    with pytest.raises(ConfigError, match="no measurement 'sped'"):
+        benchmark(["train", "--what", "sped"])
+
+
+def test_stopwatch_charges_the_innermost():
+    watch = Stopwatch()
+    inner = watch.timed("inner", lambda: time.sleep(0.02))
+    outer = watch.timed("outer", lambda: (time.sleep(0.005), inner()))
+    outer()
+    assert watch.seconds["inner"] >= 0.02 > watch.seconds["outer"] >= 0.005
+
+
+def test_profile_adds_up_and_leaves_no_trace():
+    model = benchmark_train.ours("Drawbridge", compile=False)
+    before = {owner: dict(vars(owner)) for owner in (Collector, SACLevel, TBCHRL)}
+    start = time.perf_counter()
+    parts = profile(model, 200)
+    took = 1e6 * (time.perf_counter() - start) / 200
+    assert set(parts) == set(PARTS) > set(OUTSIDE)
+    assert 0.5 * took < sum(parts.values()) <= took
+    assert all(parts[part] > 0 for part in ("environment", "acting", "bookkeeping"))
+    assert {owner: dict(vars(owner)) for owner in before} == before
+    assert "step" not in vars(model.env.envs[0].unwrapped)
+
+
+def test_full_buffers_hold_repeated_rows():
+    level = {"buffer_size": 3000, "batch_size": 16}
+    model = benchmark_train.ours("Pendulum", high=level, low=level, gradient_ratio=0.01)
+    with pytest.raises(ValueError, match="without a finished episode"):
+        benchmark_train.fill(model)
+    model.learn(1500)
+    low = model.replay_buffer.low
+    known = np.unique(low.data["here"][: low.size()], axis=0)
+    benchmark_train.fill(model)
+    assert all(buffer.full and buffer.size() == 3000 for buffer in model.replay_buffer)
+    assert np.array_equal(np.unique(low.data["here"], axis=0), known)
+
+
+@pytest.mark.parametrize("what", ["growth", "n_envs", "budget"])
+def test_further_measurements_run(what, monkeypatch):
+    monkeypatch.setattr(benchmark_train, "fill", lambda model: None)
+    lines, figures = getattr(benchmark_train, what)("Drawbridge", 20, 1)
+    assert lines
+    assert figures
