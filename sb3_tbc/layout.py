@@ -62,7 +62,7 @@ class LevelLayout(NamedTuple):
         """The same from its parts: ``here`` is the subgoal-space point of the state, ``remaining`` has a last axis."""
         asked = subgoal - here if self.relative_subgoals and here is not None else subgoal
         parts = [local, asked, remaining] if self.remaining_time else [local, asked]
-        return np.concatenate(parts, axis=-1).astype(np.float32)
+        return np.concatenate(parts, axis=-1, dtype=np.float32)
 
     def high_space(self, space: spaces.Dict) -> spaces.Box:
         """Observation space of the high level."""

@@ -65,7 +65,7 @@ class OptionRules:
 
     def remaining(self, steps: FloatArray) -> FloatArray:
         """Remaining time as the low level sees it: ``clip(dt_rem / dt_max, 0, 1)`` (paper section 4.1)."""
-        return np.asarray(np.clip(steps / self.dt_max, 0.0, 1.0))
+        return np.asarray(np.minimum(np.maximum(steps / self.dt_max, 0.0), 1.0))  # clip takes twice as long
 
 
 class Option(NamedTuple):

@@ -46,7 +46,7 @@ def forget(
     if not membrane.shape[1]:
         return membrane
     if memory == "none":
-        return np.zeros_like(membrane)
+        return np.zeros(membrane.shape, dtype=np.float32)
     over = window_over if memory == "window" else np.array(["episode_over" in info for info in infos])
     return np.where(over[:, None], np.float32(0.0), membrane) if over.any() else membrane
 
@@ -115,7 +115,7 @@ class Collector:
     def _randomise(self, unit: FloatArray) -> None:
         """Replace a share of the actions by uniform ones, in place."""
         uniform = self.rng.random(len(unit)) < self.exploration.random_fraction
-        if uniform.any():
+        if np.count_nonzero(uniform):
             unit[uniform] = self.rng.uniform(-1.0, 1.0, (int(uniform.sum()), unit.shape[1]))
 
 

@@ -69,6 +69,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
         self._memory = (self._no_memory, self._no_memory)
         self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
+        self._low, self._range = self.action_space.low, self.action_space.high - self.action_space.low  # type: ignore[attr-defined]
         self._started = False
 
     def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
@@ -115,21 +116,20 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self.clock.tick()
         reached, ended = self._window_ends(seen, dones)
         low_rewards = np.zeros(self.num_envs, dtype=np.float32)
-        if ended.any():
+        if np.count_nonzero(ended):  # several times as fast as any() on so few
             where = np.flatnonzero(ended)
             low_rewards[where] = self._close_options(where, seen, reached, dones, infos)
             self._next_options(where, observation, dones, infos)  # type: ignore[arg-type]
         return self._low_observation(observation), low_rewards, ended, infos  # type: ignore[arg-type]
 
     def _unit_actions(self, actions: FloatArray) -> FloatArray:
-        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
-        return np.asarray(2.0 * (actions - low) / (high - low) - 1.0)
+        return np.asarray(2.0 * (actions - self._low) / self._range - 1.0)
 
     def _before_reset(
         self, observation: GoalObservation, dones: NDArray[np.bool_], infos: list[dict[str, Any]]
     ) -> GoalObservation:
         """What the step led to: SB3 hides the last observation of an episode in ``info``."""
-        if not dones.any():
+        if not np.count_nonzero(dones):
             return observation
         seen = {key: np.array(observation[key]) for key in GOAL_KEYS}
         for index in np.flatnonzero(dones):

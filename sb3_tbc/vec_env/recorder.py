@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,13 +37,13 @@ class EpisodeRecorder:
         self.steps[indices] = 0
         for index in indices:
             self.options[index] = []
-        self._write(indices, self.steps[indices], observation)
+        self._write((indices, self.steps[indices]), observation)
 
     def before_step(self, actions: FloatArray, states: FloatArray, next_states: FloatArray) -> None:
         """What the low level is about to do in every environment, and its memory before and after."""
+        at = self._now()
         if int(self.steps.max()) + 1 >= self._rewards.shape[1]:
             self._grow()
-        at = (self._all, self.steps)
         self._data["actions"][at] = actions
         if states.shape[1]:
             self._data["states"][at] = states
@@ -49,9 +51,9 @@ class EpisodeRecorder:
 
     def after_step(self, rewards: FloatArray, observation: GoalObservation) -> None:
         """What the step led to in every environment, before any automatic reset."""
-        self._rewards[self._all, self.steps] = rewards
+        self._rewards[self._now()] = rewards
         self.steps += 1
-        self._write(self._all, self.steps, observation)
+        self._write(self._now(), observation)
 
     def finish(self, index: int, terminated: bool, success: bool) -> Episode:
         """The episode that has just ended in environment ``index``, as arrays of its own."""
@@ -67,9 +69,13 @@ class EpisodeRecorder:
             success=success,
         )
 
-    def _write(self, rows: NDArray[np.intp], steps: NDArray[np.int64], observation: GoalObservation) -> None:
+    def _now(self) -> tuple[Any, Any]:
+        """Index of every environment's present row; a slice where there is one, which is several times as fast."""
+        return (self._all if self.n_envs > 1 else slice(None), self.steps if self.n_envs > 1 else int(self.steps[0]))
+
+    def _write(self, at: tuple[Any, Any], observation: GoalObservation) -> None:
         for name in ("observation", *self._exact):
-            self._data[name][rows, steps] = observation[name]
+            self._data[name][at] = observation[name]
 
     def _grow(self) -> None:
         for name, array in self._data.items():

@@ -17,6 +17,7 @@ import sb3_tbc  # noqa: F401  (registers the tasks)
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly
 from sb3_tbc.tasks.generic import DescribedGoalEnv
+from sb3_tbc.vec_env.goal_vec_env import GoalVecEnv
 from sb3_tbc.zoo.schema import nearest
 
 NAMESPACE = "sb3_tbc/"
@@ -87,7 +88,8 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[st
     if module:
         _import(module, env_id)
     try:
-        env = make_vec_env(partial(_make, env_id), n_envs, seed=seed, env_kwargs=dict(env_kwargs or {}))
+        kwargs = dict(env_kwargs or {})
+        env = make_vec_env(partial(_make, env_id), n_envs, seed=seed, env_kwargs=kwargs, vec_env_cls=GoalVecEnv)
     except ConfigError:
         raise
     except Exception as error:  # An environment's own code may fail in any way.
