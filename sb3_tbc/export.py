@@ -89,6 +89,8 @@ def command(argv: Sequence[str]) -> int:
 
         info = identify(args.model, args.env)
         print(check(model, policy, args.format, path, info, args.check, args.seed))
+    elif isinstance(policy.low, Circuit) and args.format != "onnx":
+        print("closed form: not compared with the agent; measure it before you use it, with --check STEPS")
     return 0
 
 

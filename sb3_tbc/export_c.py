@@ -95,10 +95,9 @@ def _sparse(
 def _circuit(c: Circuit) -> str:
     n, (inputs, inter) = c.n_neurons, c.current_weight.shape
     sensory, currents = c.from_inputs[:inputs], c.from_inputs[inputs:]
-    ends = np.cumsum(c.layers)
     sizes = {"SENSORY": inputs, "INTER": inter, "PRESYNAPTIC": len(c.gain), "SUB_STEPS": c.sub_steps}
     text = "".join(f"#define TBC_{name} {size}\n" for name, size in sizes.items())
-    text += _indices("layer_end", ends)
+    text += _indices("relaxation_order", np.concatenate(c.order))
     input_gain = c.input_gain.astype(np.float64)
     text += exact("sensory_gain", c.sensory_gain * input_gain) + array("sensory_threshold", c.sensory_threshold)
     text += array("gain", c.gain) + array("threshold", c.threshold)

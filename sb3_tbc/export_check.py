@@ -18,11 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.export_policy import ExportedPolicy
+from sb3_tbc.export_policy import Circuit, ExportedPolicy
 from sb3_tbc.tbc_hrl import TBCHRL
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
 CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=c99")
+CLOSED_FORM_TOLERANCE = 0.05
+"""Larger differences of actions, as a share of half their range, draw a warning."""
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 Observation = Mapping[str, NDArray[Any]]
@@ -48,8 +50,9 @@ class NumpyPlayer:
         spec = importlib.util.spec_from_file_location(f"exported_{path.stem.replace('-', '_')}", path)
         if spec is None or spec.loader is None:
             raise ConfigError(f"{path} is not a Python module")
-        self.module = importlib.util.module_from_spec(spec)
+        self.module: Any = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(self.module)
+        self.closed_form = False
         self.reset()
 
     def reset(self) -> None:
@@ -58,6 +61,7 @@ class NumpyPlayer:
 
     def step(self, observation: Observation) -> NDArray[Any]:
         """The action for an observation."""
+        self.module.CLOSED_FORM = self.closed_form
         action, self.state = self.module.step(*(observation[key] for key in GOAL_KEYS), self.state)
         return np.asarray(action)
 
@@ -113,7 +117,7 @@ class CPlayer:
         command = [compiler, *STRICT, *flags, "-shared", "-fPIC", str(path), "-o", str(library), "-lm"]
         subprocess.run(command, check=True, capture_output=True, text=True)
         self.library = ctypes.CDLL(str(library))
-        self.policy, self.closed_form = policy, 0
+        self.policy, self.closed_form = policy, False
         self._state = ctypes.create_string_buffer(64 + 8 * (policy.subgoal_dim + policy.state_dim))
         self._action = np.zeros(len(policy.action_low), np.float32)
         self.reset()
@@ -126,7 +130,7 @@ class CPlayer:
         """The action for an observation."""
         goal = [np.ascontiguousarray(observation[key], np.float32) for key in GOAL_KEYS]
         pointers = [part.ctypes.data_as(ctypes.c_void_p) for part in (*goal, self._action)]
-        self.library.tbc_step(self._state, *pointers[:3], self.closed_form, pointers[3])
+        self.library.tbc_step(self._state, *pointers[:3], int(self.closed_form), pointers[3])
         return self._action.copy()
 
     def low_step_seconds(self, closed_form: bool = False, calls: int = 200) -> float:
@@ -148,6 +152,16 @@ class CPlayer:
         return float(best[0] - best[1]) / calls
 
 
+class Score(NamedTuple):
+    """Finished episodes and how many of them succeeded."""
+
+    finished: int
+    successes: int
+
+    def __str__(self) -> str:
+        return f"{self.successes} of {self.finished} episodes"
+
+
 class CheckResult(NamedTuple):
     """What a comparison found."""
 
@@ -155,11 +169,40 @@ class CheckResult(NamedTuple):
     episodes: int
     windows: int
     max_difference: float
+    rms_difference: float
+    score: Score
 
     def __str__(self) -> str:
         return (
             f"checked: {self.steps} steps, {self.episodes} episodes, {self.windows} windows; largest difference from "
             f"predict(deterministic=True): {self.max_difference:.2g}"
+        )
+
+
+class ClosedFormResult(NamedTuple):
+    """The closed form beside the agent on the states the agent meets, and what each achieves alone."""
+
+    beside: CheckResult
+    alone: Score
+    half_range: float  # of the widest action
+
+    @property
+    def share(self) -> float:
+        """Root mean square difference of actions as a share of half their range."""
+        return self.beside.rms_difference / self.half_range
+
+    def __str__(self) -> str:
+        text = (
+            f"closed form: actions differ from predict's by {self.beside.rms_difference:.2g} rms and "
+            f"{self.beside.max_difference:.2g} at most; acting alone for {self.beside.steps} steps it succeeds in "
+            f"{self.alone}, the agent in {self.beside.score}"
+        )
+        if self.share <= CLOSED_FORM_TOLERANCE:
+            return text
+        return (
+            f"{text}\nWARNING: the closed form does not act as this agent does (rms {self.share:.0%} of half the range "
+            "of actions): deploy the integrated form. Agents that carry their potentials on (memory window or episode) "
+            "come closer to it than those that start every step from rest."
         )
 
 
@@ -172,7 +215,7 @@ def player(kind: str, path: Path, policy: ExportedPolicy) -> Player:
 
 def check(
     model: TBCHRL, policy: ExportedPolicy, kind: str, path: Path, info: Mapping[str, Any], steps: int, seed: int
-) -> CheckResult:
+) -> str:
     """Play the exported policy beside ``predict(deterministic=True)`` on the observations the agent meets.
 
     :param model: the agent
@@ -182,28 +225,75 @@ def check(
     :param info: ``env_id`` and ``env_kwargs`` of the task
     :param steps: environment steps; episodes follow one another
     :param seed: of the first episode
+    :return: what to print: the comparison and, where the file holds a circuit's closed form, how well that does
     """
     env = gym.make(info["env_id"], **(info.get("env_kwargs") or {}))
+    exported = player(kind, path, policy)
     try:
-        return compare(model, player(kind, path, policy), env, steps, seed)
+        lines = [str(compare(model, exported, env, steps, seed))]
+        if isinstance(policy.low, Circuit) and isinstance(exported, CPlayer | NumpyPlayer):
+            lines.append(str(compare_closed_form(model, exported, env, steps, seed)))
+        return "\n".join(lines)
     finally:
         env.close()
 
 
 def compare(model: TBCHRL, exported: Player, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> CheckResult:
     """The comparison itself, see :func:`check`."""
+    beside = _Beside(model, exported)
+    score = play(beside, env, steps, seed)
+    difference = np.abs(beside.differences)
+    rms = float(np.sqrt(np.mean(difference**2)))
+    return CheckResult(steps, beside.episodes, beside.windows, float(difference.max()), rms, score)
+
+
+def compare_closed_form(
+    model: TBCHRL, exported: CPlayer | NumpyPlayer, env: gym.Env[Any, Any], steps: int, seed: int = 0
+) -> ClosedFormResult:
+    """The closed form of an exported circuit beside the agent, and then alone."""
+    exported.closed_form = True
+    exported.reset()
+    beside = compare(model, exported, env, steps, seed)
+    exported.reset()
+    actions: Any = model.action_space
+    half_range = 0.5 * float(np.max(actions.high - actions.low))
+    return ClosedFormResult(beside, play(exported, env, steps, seed), half_range)
+
+
+def play(who: Player, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> Score:
+    """Let a player act for some steps; episodes follow one another, the last one is cut."""
     observation, _ = env.reset(seed=seed)
-    state, worst, windows, episodes = None, 0.0, 0, 1
+    finished = successes = 0
     for _ in range(steps):
-        action, state = model.predict(observation, state, deterministic=True)
-        worst = max(worst, float(np.abs(action - exported.step(observation)).max()))
-        windows += int(state is not None and state[2][0] == 1)
-        observation, _, terminated, truncated, _ = env.step(action)
+        observation, _, terminated, truncated, info = env.step(who.step(observation))
         if terminated or truncated:
+            finished, successes = finished + 1, successes + int(info.get("is_success", False))
             observation, _ = env.reset()
-            exported.reset()
-            state, episodes = None, episodes + 1
-    return CheckResult(steps, episodes, windows, worst)
+            who.reset()
+    return Score(finished, successes)
+
+
+class _Beside:
+    """A player that acts as the agent does and notes how far an exported policy would have differed."""
+
+    def __init__(self, model: TBCHRL, exported: Player) -> None:
+        self.model, self.exported = model, exported
+        self.state: tuple[NDArray[Any], ...] | None = None
+        self.differences: list[NDArray[Any]] = []
+        self.episodes, self.windows = 1, 0
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.exported.reset()
+        self.state = None
+        self.episodes += 1
+
+    def step(self, observation: Observation) -> NDArray[Any]:
+        """The agent's action for an observation."""
+        action, self.state = self.model.predict(dict(observation), self.state, deterministic=True)
+        self.differences.append(action - self.exported.step(observation))
+        self.windows += int(self.state is not None and self.state[2][0] == 1)
+        return action
 
 
 class Cortex(NamedTuple):

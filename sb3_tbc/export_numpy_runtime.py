@@ -29,7 +29,7 @@ def initial_state() -> State:
         "subgoal": np.zeros(len(ARRAYS["subgoal_low"])),
         "time_budget": 0.0,
         "elapsed": -1,  # no option yet
-        "membrane": np.zeros(sum(SETTINGS.get("low.layers", ())), dtype=np.float32),
+        "membrane": np.zeros(np.shape(ARRAYS.get("low.capacitance", ())), dtype=np.float32),
     }
 
 
@@ -133,11 +133,11 @@ def _integrate(seen: Array, membrane: Array) -> Array:
 
 
 def _relax(seen: Array, membrane: Array) -> Array:
-    """The closed form, layer after layer."""
+    """The closed form, group after group."""
     a, n, p = ARRAYS, len(membrane), len(ARRAYS["low.gain"])
-    drive, membrane, start = _drive(seen), membrane.copy(), 0
-    for size in SETTINGS["low.layers"]:
-        at, start = slice(start, start + size), start + size
+    drive, membrane = _drive(seen), membrane.copy()
+    for group in SETTINGS["low.order"]:
+        at = list(group)
         total = drive + _logistic(membrane[:p] * a["low.gain"] - a["low.threshold"]) @ a["low.recurrent"]
         weighted, conductance = total[:n][at], total[n:][at]
         share = -np.expm1(-conductance / a["low.capacitance"][at])

@@ -59,7 +59,7 @@ class Circuit:
     """An NDBC circuit with the conductance cell's derived arrays; see :class:`~sb3_tbc.ndbc.cell.ConductanceArrays`."""
 
     sub_steps: int
-    layers: tuple[int, int, int]  # inter, command, motor
+    order: tuple[tuple[int, ...], ...]  # in which the closed form takes the neurons, group after group
     input_gain: FloatArray
     sensory_gain: FloatArray
     sensory_threshold: FloatArray
@@ -77,7 +77,7 @@ class Circuit:
     @property
     def n_neurons(self) -> int:
         """Neurons with a membrane potential."""
-        return sum(self.layers)
+        return len(self.capacitance)
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ def read_circuit(net: NDBCNet, n_actions: int) -> Circuit:
     readout = np.zeros((wiring.n_neurons, n_actions), np.float32)
     readout[net.read_from :] = _numpy(net.readout_weight)[:n_actions].T
     return Circuit(
-        net.sub_steps, (wiring.inter, wiring.command, wiring.motor), _numpy(net.input_gain), _numpy(a.sensory_gain),
+        net.sub_steps, wiring.relaxation_order(), _numpy(net.input_gain), _numpy(a.sensory_gain),
         _numpy(cell.sensory_threshold), _numpy(a.current_weight), _numpy(cell.current_bias), _numpy(a.from_inputs),
         _numpy(a.recurrent), _numpy(a.rest), _numpy(a.capacitance), _numpy(a.gain), _numpy(cell.threshold),
         readout, _numpy(net.readout_bias)[:n_actions],

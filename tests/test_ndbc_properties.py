@@ -57,8 +57,10 @@ def derivative(net: NDBCNet, inputs: NDArray[np.float64]) -> object:
     return rate
 
 
-def exact(net: NDBCNet, inputs: NDArray[np.float64], state: NDArray[np.float64]) -> NDArray[np.float64]:
-    return solve_ivp(derivative(net, inputs), (0.0, 1.0), state, rtol=1e-10, atol=1e-12, method="LSODA").y[:, -1]
+def exact(
+    net: NDBCNet, inputs: NDArray[np.float64], state: NDArray[np.float64], duration: float = 1.0
+) -> NDArray[np.float64]:
+    return solve_ivp(derivative(net, inputs), (0.0, duration), state, rtol=1e-10, atol=1e-12, method="LSODA").y[:, -1]
 
 
 @given(SEEDS, st.integers(1, 6), st.floats(0.01, 100.0), st.floats(0.1, 10.0))
@@ -92,17 +94,30 @@ def test_halving_the_step_converges_at_first_order(seed: int) -> None:
     np.testing.assert_allclose(orders, 1.0, atol=0.15)
 
 
-@given(SEEDS, st.floats(0.2, 3.0))
-@settings(max_examples=25, deadline=None)
-def test_closed_form_error_bound_holds(seed: int, size: float) -> None:
-    net = random_net(seed, spread=1.0).double()
+@given(SEEDS, st.floats(0.2, 3.0), st.floats(0.0, 2.0), st.floats(0.1, 3.0))
+@settings(max_examples=40, deadline=None)
+def test_closed_form_error_bound_holds(seed: int, size: float, spread: float, duration: float) -> None:
+    net = random_net(seed, spread=spread).double()
     closed = ClosedFormNDBC(net, dtype=np.float64)
     rng = np.random.default_rng(seed)
     inputs, state = size * rng.normal(size=(1, 3)), size * rng.normal(size=(1, net.state_dim))
-    error = np.abs(closed(inputs, state)[1][0] - exact(net, inputs[0], state[0]))
-    bound = closed.error_bound(inputs, state)[0]
-    assert (error <= bound + 1e-7).all()
+    potentials = closed._relax(inputs, state, duration).after(duration)[0]
+    error = np.abs(potentials - exact(net, inputs[0], state[0], duration))
+    for pieces, passes in ((1, 1), (4, 3), (32, 8)):
+        assert (error <= closed.error_bound(inputs, state, duration, pieces, passes)[0] + 1e-7).all()
     assert error[net.wiring.layer("inter")].max() < 1e-7, "inter neurons hear only inputs: the form is exact for them"
+
+
+def test_closed_form_error_bound_says_something() -> None:
+    ratios = []
+    for seed in range(20):
+        net = random_net(seed, spread=0.5).double()
+        closed = ClosedFormNDBC(net, dtype=np.float64)
+        rng = np.random.default_rng(seed)
+        inputs, state = rng.normal(size=(1, 3)), rng.normal(size=(1, net.state_dim))
+        error = np.abs(closed(inputs, state)[1][0] - exact(net, inputs[0], state[0]))
+        ratios.append(closed.error_bound(inputs, state)[0].max() / error.max())
+    assert np.median(ratios) < 4.0
 
 
 @given(SEEDS, st.integers(1, 6), st.floats(0.0, 5.0))

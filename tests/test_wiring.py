@@ -62,6 +62,26 @@ def test_layers_reach_and_polarity(n_inputs: int, inter: int, command: int, moto
     assert NDBCWiring.from_dict(json.loads(json.dumps(wiring.to_dict()))) == wiring
 
 
+@given(st.integers(1, 6), st.integers(1, 7), st.integers(1, 3), st.data())
+@settings(max_examples=60, deadline=None)
+def test_relaxation_order_goes_with_the_synapses(inter: int, command: int, motor: int, data: st.DataObject) -> None:
+    synapses, seed = data.draw(st.integers(0, 12)), data.draw(st.integers(0, 99))
+    wiring = NDBCWiring(3, inter, command, motor, 2, 3, synapses, 2, seed=seed)
+    groups = wiring.relaxation_order()
+    place = {neuron: k for k, group in enumerate(groups) for neuron in group}
+    assert sorted(place) == list(range(wiring.n_neurons))
+    assert groups[0] == tuple(range(inter))
+    assert not any(wiring.recurrent[np.ix_(group, group)].any() for group in groups), "a group hears itself"
+    back = {(int(i), int(j)) for i, j in np.argwhere(wiring.recurrent) if place[i] > place[j]}
+    assert all(wiring.layer_of(i) == wiring.layer_of(j) == "command" for i, j in back), "only loops are opened"
+
+
+def test_a_single_recurrent_synapse_is_heard_at_its_end() -> None:
+    wiring = NDBCWiring(9, *TABLE_A1["Pendulum"])
+    place = {neuron: k for k, group in enumerate(wiring.relaxation_order()) for neuron in group}
+    assert all(place[i] < place[j] for i, j in np.argwhere(wiring.recurrent).tolist())
+
+
 def test_seed_decides_the_draw() -> None:
     numbers = TABLE_A1["AntFourRooms"]
     assert NDBCWiring(9, *numbers, seed=1) == NDBCWiring(9, *numbers, seed=1)

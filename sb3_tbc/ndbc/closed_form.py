@@ -9,7 +9,6 @@ import torch as th
 from numpy.typing import NDArray
 
 from sb3_tbc.ndbc.cell import ConductanceCell
-from sb3_tbc.ndbc.wiring import LAYERS
 
 if TYPE_CHECKING:
     from sb3_tbc.ndbc.network import NDBCNet
@@ -26,13 +25,28 @@ class ClosedFormError(NamedTuple):
     bound_max: float  # largest error bound against the exact solution of the differential equation
 
 
+class Relaxation(NamedTuple):
+    """One control step of the closed form, ``V(t) = (start - target) exp(-rate t) + target``, each ``(batch, N)``."""
+
+    start: FloatArray
+    target: FloatArray
+    rate: FloatArray
+    total: FloatArray  # sum of conductances: rate x capacitance
+    heard: tuple[FloatArray, ...]  # the release of presynaptic neurons that each group hears, (batch, P)
+
+    def after(self, time: float) -> FloatArray:
+        """Potentials after ``time``."""
+        return np.asarray(self.start - (self.target - self.start) * np.expm1(-self.rate * time))
+
+
 class ClosedFormNDBC:
     """``V(t) = (V0 - A) exp(-(w_tau + f(I)) t) + A`` for conductance dynamics, without retraining. NumPy only.
 
     With presynaptic activity held fixed the equation is linear: ``w_tau = g_l / C``, ``f(I) = sum w sigma / C`` over
-    all synapses and the input current, and A is the potential it relaxes to. Layers are taken in order, each seeing
-    what the layers before it reach by the end of the control step, so a signal passes from sensory to motor neurons in
-    one go. Inter neurons hear only inputs: for them the form is exact.
+    all synapses and the input current, and A is the potential it relaxes to. Neurons are taken in the wiring's
+    :meth:`~sb3_tbc.ndbc.wiring.NDBCWiring.relaxation_order`, each hearing what those before it reach by the end of the
+    control step, so a signal passes from sensory to motor neurons in one go. Inter neurons hear only inputs: for them
+    the form is exact.
 
     :param net: the network; its weights are read now and by :meth:`refresh`
     :param dtype: precision of the arithmetic
@@ -43,7 +57,7 @@ class ClosedFormNDBC:
         if not isinstance(net.cell, ConductanceCell):
             raise ValueError("only conductance dynamics have the closed form; this network is dissipative")
         self.net, self.cell, self.dtype = net, net.cell, dtype
-        self.layers = [net.wiring.layer(name) for name in LAYERS]
+        self.groups = [np.array(group) for group in net.wiring.relaxation_order()]
         self.refresh()
 
     def refresh(self) -> None:
@@ -54,8 +68,11 @@ class ClosedFormNDBC:
         named |= {name: getattr(cell, name) for name in ("sensory_threshold", "current_bias", "threshold")}
         named |= {name: getattr(net, name) for name in ("input_gain", "readout_weight", "readout_bias")}
         self.values = {name: tensor.detach().cpu().numpy().astype(self.dtype) for name, tensor in named.items()}
-        v, n = self.values, net.state_dim
-        self.reversal_weight, self.weight = v["recurrent"][:, :n], v["recurrent"][:, n:]
+        n = net.state_dim
+        recurrent = self.values["recurrent"]
+        self._columns = [recurrent[:, np.concatenate((group, group + n))] for group in self.groups]
+        weighted, self.weight = recurrent[:, :n], recurrent[:, n:]
+        self.reversal = np.divide(weighted, self.weight, out=np.zeros_like(weighted), where=self.weight > 0)
 
     def __call__(self, inputs: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """One control step, as :class:`FrozenNDBC` takes it.
@@ -64,7 +81,7 @@ class ClosedFormNDBC:
         :param state: potentials, ``(batch, state_dim)``; not changed
         :return: outputs ``(batch, n_outputs)`` and the next potentials
         """
-        potentials, _, _ = self._relax(inputs, state, 1.0)
+        potentials = self._relax(inputs, state, 1.0).after(1.0)
         read = potentials[:, self.net.read_from :]
         return read @ self.values["readout_weight"].T + self.values["readout_bias"], potentials
 
@@ -78,57 +95,71 @@ class ClosedFormNDBC:
 
     def _released(self, potentials: FloatArray) -> FloatArray:
         gain = self.values["gain"]
-        return _logistic(potentials[:, : len(gain)] * gain - self.values["threshold"])
+        return _logistic(potentials[..., : len(gain)] * gain - self.values["threshold"])
 
-    def _relax(
-        self, inputs: FloatArray, state: FloatArray, duration: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Potentials after ``duration``, total conductances, and ``1 - exp(-(w_tau + f) t)``, each ``(batch, N)``."""
-        n = self.net.state_dim
-        drive = self._drive(inputs)
-        potentials = np.array(state, dtype=self.dtype)
-        totals, relaxed = np.empty_like(potentials), np.empty_like(potentials)
-        for layer in self.layers:
-            released = self._released(potentials)
-            total = drive[:, n:][:, layer] + released @ self.weight[:, layer]
-            target = (drive[:, :n][:, layer] + released @ self.reversal_weight[:, layer]) / total
-            share = -np.expm1(-total * duration / self.values["capacitance"][layer])
-            potentials[:, layer] += (target - potentials[:, layer]) * share
-            totals[:, layer], relaxed[:, layer] = total, share
-        return potentials, totals, relaxed
+    def _relax(self, inputs: FloatArray, state: FloatArray, duration: float) -> Relaxation:
+        """What every neuron relaxes to and how fast, later groups hearing where earlier ones are after ``duration``."""
+        n, drive = self.net.state_dim, self._drive(inputs)
+        start = np.asarray(state, dtype=self.dtype)
+        potentials, target, total = start.copy(), np.empty_like(start), np.empty_like(start)
+        heard = []
+        for group, columns in zip(self.groups, self._columns, strict=True):
+            heard.append(self._released(potentials))
+            weighted, conductance = np.split(heard[-1] @ columns, 2, axis=1)
+            total[:, group] = conductance + drive[:, group + n]
+            target[:, group] = (weighted + drive[:, group]) / total[:, group]
+            share = -np.expm1(-total[:, group] * duration / self.values["capacitance"][group])
+            potentials[:, group] += (target[:, group] - start[:, group]) * share
+        return Relaxation(start, target, total / self.values["capacitance"], total, tuple(heard))
 
-    def error_bound(self, inputs: FloatArray, state: FloatArray, duration: float = 1.0) -> FloatArray:
+    def error_bound(
+        self, inputs: FloatArray, state: FloatArray, duration: float = 1.0, pieces: int = 32, passes: int = 8
+    ) -> FloatArray:
         """Bound on ``|V_closed - V_exact|`` per neuron after ``duration`` control steps from ``state``, ``(batch, N)``.
 
-        The error e of a neuron obeys ``C e' = -D e + r`` with ``|r| <= sum_j w_j max|E_j - V| |sigma_j(t) - sigma_j|``,
-        hence ``|e| <= r (1 - exp(-D t / C)) / D``. A presynaptic neuron's logistic is off by at most ``gain / 4`` times
-        how far its potential strays from the value the form used, and by at most one.
+        The error e of neuron i obeys ``C e' = -D e + r``, ``|r| <= sum_j w_ij |E_ij - V_i| |sigma_j(t) - sigma_j|``,
+        where D and sigma_j are those of the closed form. The control step is cut into pieces; in each, potentials lie
+        in a tube, at first the interval no potential leaves. The tubes bound r, that bounds e, and the closed form plus
+        and minus e is the next, narrower tube.
+
+        :param inputs: ``(batch, n_inputs)``
+        :param state: potentials, ``(batch, state_dim)``
+        :param duration: control steps
+        :param pieces: pieces of the control step, shortest at its start, where potentials move fastest
+        :param passes: how often the tubes are narrowed; the bound holds after any number
         """
-        end, totals, relaxed = self._relax(inputs, state, duration)
-        low, high = self.span(state)
-        reach = self._reach(low, high)
-        span = high - low
-        stray = span[:, : len(self.values["gain"])].copy()  # neurons of the same or a later layer: V_j(0) was used
-        error = np.zeros_like(end)
-        for layer in self.layers:
-            missed = np.minimum(1.0, stray * self.values["gain"] / 4.0)
-            push = np.einsum("bp,pn,bpn->bn", missed, self.weight[:, layer], reach[:, :, layer])
-            error[:, layer] = np.minimum(push * relaxed[:, layer] / totals[:, layer], span[:, layer])
-            moved = np.abs(end[:, layer] - np.asarray(state)[:, layer]) + error[:, layer]
-            count = max(0, min(layer.stop, stray.shape[1]) - layer.start)
-            stray[:, layer.start : layer.start + count] = np.minimum(moved, span[:, layer])[:, :count]
-        return error
+        closed = self._relax(inputs, state, duration)
+        times = duration * np.linspace(0.0, 1.0, pieces + 1) ** 3
+        path = np.stack([closed.after(t) for t in times], axis=1)
+        floor, ceiling = np.minimum(path[:, 1:], path[:, :-1]), np.maximum(path[:, 1:], path[:, :-1])
+        low, high = (np.repeat(bound[:, None], pieces, axis=1) for bound in self.span(state))
+        for _ in range(passes):
+            push = self._push(closed, low, high) / closed.total[:, None]
+            error = np.zeros_like(path)
+            for k, length in enumerate(np.diff(times)):
+                kept = np.exp(-closed.rate * length)
+                error[:, k + 1] = error[:, k] * kept + push[:, k] * (1.0 - kept)
+            worst = np.maximum(error[:, 1:], error[:, :-1])  # in between it is monotonic
+            low, high = np.maximum(low, floor - worst), np.minimum(high, ceiling + worst)
+        return np.minimum(error[:, -1], np.maximum(high[:, -1] - path[:, -1], path[:, -1] - low[:, -1]))
+
+    def _push(self, closed: Relaxation, low: FloatArray, high: FloatArray) -> FloatArray:
+        """Bound on ``sum_j w_ij |E_ij - V_i| |sigma_j(t) - sigma_j|`` in each piece's tube, ``(batch, pieces, N)``."""
+        least, most = self._released(low), self._released(high)
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        push = np.zeros_like(low)
+        for group, heard in zip(self.groups, closed.heard, strict=True):
+            missed = np.maximum(most - heard[:, None], heard[:, None] - least)
+            for j, i in np.argwhere(self.weight[:, group] > 0):
+                post = group[i]
+                reach = np.abs(self.reversal[j, post] - middle[..., post]) + half[..., post]
+                push[..., post] += self.weight[j, post] * missed[..., j] * reach
+        return push
 
     def span(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The interval the exact potentials cannot leave from ``state`` on, lower and upper bounds ``(batch, N)``."""
         low, high = (bound.cpu().numpy().astype(self.dtype) for bound in self.cell.bounds(np.inf, -np.inf))
         return np.minimum(low, state), np.maximum(high, state)
-
-    def _reach(self, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Largest ``|E_ij - V_i|`` inside the interval, ``(batch, P, N)``; zero where there is no synapse."""
-        reversal = np.divide(self.reversal_weight, self.weight, out=np.zeros_like(self.weight), where=self.weight > 0)
-        distance = np.maximum(np.abs(reversal - low[:, None]), np.abs(high[:, None] - reversal))
-        return np.asarray(np.where(self.weight > 0, distance, 0.0))
 
     def compare(self, inputs: FloatArray, state: FloatArray) -> ClosedFormError:
         """The closed form beside the network's K sub-steps, one control step from each state."""

@@ -115,6 +115,27 @@ class NDBCWiring:
         """A name per neuron, ``("inter0", ..., "motor0", ...)``, in the order of the state vector."""
         return tuple(f"{name}{i}" for name in LAYERS for i in range(getattr(self, name)))
 
+    def relaxation_order(self) -> tuple[tuple[int, ...], ...]:
+        """Groups of neurons, each of which hears only neurons of earlier groups, as far as there is no loop.
+
+        A loop is opened at the one of its neurons that hears the fewest of those still to come.
+        """
+        heard = self.recurrent != 0
+        np.fill_diagonal(heard, False)
+        before = heard.copy()  # whether a path leads from one neuron to the other
+        for via in range(self.n_neurons):
+            before |= np.outer(before[:, via], before[via])
+        downstream = before & ~before.T  # of another neuron that is not in the same loop
+        waiting = np.ones(self.n_neurons, dtype=bool)
+        groups = []
+        while waiting.any():
+            free = np.flatnonzero(waiting & ~downstream[waiting].any(axis=0))
+            missing = heard[waiting][:, free].sum(axis=0)
+            ready = free[missing == 0] if not missing.all() else free[[missing.argmin()]]
+            waiting[ready] = False
+            groups.append(tuple(ready.tolist()))
+        return tuple(groups)
+
     def to_dict(self) -> dict[str, Any]:
         """Plain data: sizes, seed, notes, and every synapse as ``[presynaptic, postsynaptic, polarity]``."""
         return {

@@ -57,24 +57,24 @@ static void circuit_integrate(tbc_real *v, const tbc_real *weighted, const tbc_r
     }
 }
 
-/* V(t) = (V0 - A) exp(-(w_tau + f) t) + A, layer after layer. */
+/* V(t) = (V0 - A) exp(-(w_tau + f) t) + A, each neuron hearing where those before it have come to. */
 static void circuit_relax(tbc_real *v, const tbc_real *weighted, const tbc_real *total)
 {
     tbc_real released[TBC_PRESYNAPTIC];
-    int i, layer, begin = 0;
+    int i, k;
     for (i = 0; i < TBC_PRESYNAPTIC; ++i) {
         released[i] = logistic(gain[i] * v[i] - threshold[i]);
     }
-    for (layer = 0; layer < 3; ++layer) {
-        for (i = begin; i < layer_end[layer]; ++i) {
-            tbc_real w = weighted[i], g = total[i];
-            circuit_receive(i, released, &w, &g);
-            v[i] -= (w / g - v[i]) * TBC_EXPM1(-g / capacitance[i]);
-        }
-        for (i = begin; i < layer_end[layer] && i < TBC_PRESYNAPTIC; ++i) {
+    for (k = 0; k < TBC_STATE; ++k) {
+        tbc_real w, g;
+        i = relaxation_order[k];
+        w = weighted[i];
+        g = total[i];
+        circuit_receive(i, released, &w, &g);
+        v[i] -= (w / g - v[i]) * TBC_EXPM1(-g / capacitance[i]);
+        if (i < TBC_PRESYNAPTIC) {
             released[i] = logistic(gain[i] * v[i] - threshold[i]);
         }
-        begin = layer_end[layer];
     }
 }
 
