@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -204,20 +205,21 @@ def _level_env(model: TBCHRL) -> gym.Env[Any, Any]:
     return _SpacesEnv(model.low.observation_space, model.low.action_space)
 
 
-def fill(model: TBCHRL) -> None:
-    """Fill both replay buffers up by repeating what they hold.
+def fill(model: TBCHRL, steps: int) -> None:
+    """Fill both replay buffers as far as so many environment steps would, by repeating what they hold.
 
     :raises ValueError: if there is nothing to repeat
     """
     for buffer in model.replay_buffer:
         if not buffer.size():
             raise ValueError("a buffer without a finished episode cannot be filled: learn for longer first")
+        wanted = min(buffer.buffer_size, round(buffer.size() * steps / model.num_timesteps))
         held = {name: array[: buffer.size()].copy() for name, array in buffer.data.items()}
         rows = len(next(iter(held.values())))
         times = max(1, min(ROW_LIMIT, buffer.buffer_size) // rows)
         block = {name: np.tile(array, (times, 1)) for name, array in held.items()}
-        while not buffer.full:
-            room = buffer.buffer_size - buffer.pos
+        while buffer.size() < wanted:
+            room = wanted - buffer.size()
             buffer._extend({name: array[:room] for name, array in block.items()})
 
 
@@ -229,7 +231,7 @@ def growth(task: str, steps: int, rounds: int) -> Result:
     figures: Figures = {}
     for name in ("empty", "full"):
         if name == "full":
-            fill(model)
+            fill(model, full_budget(task))
             stretch(contender, steps)
         stretches = [stretch(contender, steps) for _ in range(rounds)]
         figures[name] = {
@@ -268,31 +270,36 @@ def memory(task: str) -> Result:
     code = f"import sb3_tbc.benchmark_train as b; print(b.peak_memory({task!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     megabytes = float(done.stdout.split()[-1])
-    return [f"{task}: {megabytes:.0f} MB, the whole process, full buffers"], {"megabytes": megabytes}
+    return [f"{task}: {megabytes:.0f} MB, the whole process, buffers of the full budget"], {"megabytes": megabytes}
 
 
 def peak_memory(task: str) -> float:
-    """Learn, fill the buffers, learn on; the peak of this process in MB."""
+    """Learn, fill the buffers as the full budget would, learn on; the peak of this process in MB."""
     model = ours(task, learning_starts=0)
-    steps = 3 * _episode_steps(model)
+    steps = 3 * round(model.rules.dt_max * model.rules.max_options)  # episodes
     model.learn(steps)
-    fill(model)
+    fill(model, full_budget(task))
     gc.collect()
     model.learn(steps, reset_num_timesteps=False)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    status = Path("/proc/self/status")
+    if status.is_file():  # the other way counts what the process was forked from, too
+        (line,) = (line for line in status.read_text().splitlines() if line.startswith("VmHWM"))
+        return int(line.split()[1]) / 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1024 if sys.platform == "linux" else 1024**2)
 
 
-def _episode_steps(model: TBCHRL) -> int:
-    return round(model.rules.dt_max * model.rules.max_options)
+def full_budget(task: str) -> int:
+    """Environment steps of the paper's table 1."""
+    return load_config("tbc-hrl", resolve_env(task)[0]).n_timesteps
 
 
 def budget(task: str, steps: int, rounds: int) -> Result:
     """Time of the full budget: CPU time per step with full buffers, times the steps of table 1."""
     model = ours(task, learning_starts=0)
-    total = load_config("tbc-hrl", resolve_env(task)[0]).n_timesteps
+    total = full_budget(task)
     contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)
     stretch(contender, max(steps, 1000))
-    fill(model)
+    fill(model, total)
     stretch(contender, steps)
     runs = [stretch(contender, steps) for _ in range(rounds)]
     per_step = statistics.median(s.cpu / s.steps for s in runs)

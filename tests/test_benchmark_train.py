@@ -60,18 +60,18 @@ def test_full_buffers_hold_repeated_rows():
     level = {"buffer_size": 3000, "batch_size": 16}
     model = benchmark_train.ours("Pendulum", high=level, low=level, gradient_ratio=0.01)
     with pytest.raises(ValueError, match="without a finished episode"):
-        benchmark_train.fill(model)
+        benchmark_train.fill(model, 1000)
     model.learn(1500)
     low = model.replay_buffer.low
     known = np.unique(low.data["here"][: low.size()], axis=0)
-    benchmark_train.fill(model)
+    benchmark_train.fill(model, 10**6)
     assert all(buffer.full and buffer.size() == 3000 for buffer in model.replay_buffer)
     assert np.array_equal(np.unique(low.data["here"], axis=0), known)
 
 
 @pytest.mark.parametrize("what", ["growth", "n_envs", "budget"])
 def test_further_measurements_run(what, monkeypatch):
-    monkeypatch.setattr(benchmark_train, "fill", lambda model: None)
+    monkeypatch.setattr(benchmark_train, "fill", lambda model, steps: None)
     lines, figures = getattr(benchmark_train, what)("Drawbridge", 20, 1)
     assert lines
     assert figures
