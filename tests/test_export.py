@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium as gym
@@ -13,17 +14,29 @@ import pytest
 import torch as th
 
 import sb3_tbc.export
-from sb3_tbc import TBCHRL
+from sb3_tbc import TBCHRL, train
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export_c import to_c
-from sb3_tbc.export_check import CPlayer, NumpyPlayer, OnnxPlayer, compare, cortex_m4
+from sb3_tbc.export_check import (
+    CPlayer,
+    NumpyPlayer,
+    OnnxPlayer,
+    Player,
+    compare,
+    compare_closed_form,
+    cortex_m4,
+    player,
+)
 from sb3_tbc.export_policy import Circuit, ExportedPolicy, _Probe, extract
 from sb3_tbc.ndbc.closed_form import ClosedFormNDBC
 from sb3_tbc.tbc_hrl import HAC
+from sb3_tbc.zoo.algorithms import load_two_levels
 
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 ANT = {"inter": 12, "command": 10, "motor": 8, "sensory_fanout": 5, "inter_fanout": 8,
        "recurrent_command_synapses": 2, "motor_fanin": 6}  # fmt: skip
+PENDULUM = {"inter": 6, "command": 6, "motor": 1, "sensory_fanout": 3, "inter_fanout": 4,
+            "recurrent_command_synapses": 1, "motor_fanin": 4}  # fmt: skip
 CASES = {
     "reached": ("Pendulum", {"window_end": "reached", "memory": "window"}),
     "relative": ("UR5Reacher", {"window_end": "reached", "relative_subgoals": True, "memory": "episode", "dt_min": 3}),
@@ -91,6 +104,57 @@ def test_large_weights_do_not_part_them(case: str, kind: str, tmp_path: Path) ->
         result = compare(model, player, env, 300, seed)
         assert result.max_difference < 1e-5
         assert result.windows >= 3
+
+
+def assert_every_format_agrees(model: TBCHRL, env: gym.Env, folder: Path) -> None:
+    """A thousand steps of real episodes with window changes; the two closed forms beside each other too."""
+    policy = extract(model)
+    players: dict[str, Player] = {}
+    for kind, write in sb3_tbc.export.WRITERS.items():
+        if (kind == "c" and shutil.which("cc") is None) or (kind == "onnx" and find_spec("onnxruntime") is None):
+            continue
+        path = folder / f"policy{sb3_tbc.export.SUFFIXES[kind]}"
+        write(policy, path)
+        players[kind] = player(kind, path, policy)
+        result = compare(model, players[kind], env, 1000)
+        assert result.max_difference < 1e-5, kind
+        assert result.windows >= 20
+    if "c" in players:
+        in_c, in_numpy = players["c"], players["numpy"]
+        in_c.closed_form = in_numpy.closed_form = True
+        for one in (in_c, in_numpy):
+            one.reset()
+        observation, _ = env.reset(seed=1)
+        for _ in range(1000):
+            action = in_c.step(observation)
+            np.testing.assert_allclose(in_numpy.step(observation), action, atol=1e-5)
+            observation, _, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                observation, _ = env.reset()
+                in_c.reset()
+                in_numpy.reset()
+
+
+@pytest.mark.parametrize("case", ["reached", "memoryless"])
+def test_a_trained_agent_is_exported_as_it_acts(case: str, tmp_path: Path) -> None:
+    fast = {"learning_rate": 1e-2, "batch_size": 32, "policy_kwargs": {"net_arch": [12, 8]}}
+    env = gym.make("sb3_tbc/Pendulum-v0")
+    low = {**fast, "policy_kwargs": {**fast["policy_kwargs"], "ndbc": PENDULUM}}
+    model = TBCHRL("MultiInputPolicy", env, seed=1, compile=False, **{**CASES[case][1], "high": fast, "low": low})
+    before = model.low.policy.average_actor.net.readout_weight.detach().clone()
+    model.learn(500)
+    assert float((model.low.policy.average_actor.net.readout_weight - before).abs().max()) > 0.05
+    assert_every_format_agrees(model, env, tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", [[], ["memory:window", "window_end:reached"]])
+def test_a_fully_trained_agent_is_exported_as_it_acts(extra: list[str], tmp_path: Path) -> None:
+    arguments = ["--env", "Pendulum", "--n-timesteps", "60000", "--log-folder", str(tmp_path), "--no-progress"]
+    assert train.command([*arguments, *(["--hyperparams", *extra] if extra else [])]) == 0
+    model = load_two_levels(next(tmp_path.rglob("best_model.zip")))
+    assert isinstance(model, TBCHRL)
+    assert_every_format_agrees(model, gym.make("sb3_tbc/Pendulum-v0"), tmp_path)
 
 
 def test_an_onnx_graph_takes_a_batch(pendulum: tuple[TBCHRL, ExportedPolicy], tmp_path: Path) -> None:
@@ -174,6 +238,18 @@ def test_the_largest_low_level_fits_a_microcontroller(tmp_path: Path) -> None:
     assert size is not None
     assert size.flash + size.library < 16 * 1024
     assert size.stack + size.state < 2 * 1024
+
+
+def test_a_closed_form_unlike_the_agent_draws_a_warning(tmp_path: Path) -> None:
+    model, env = make("memoryless")
+    policy = extract(model)
+    sb3_tbc.export.write_numpy(policy, tmp_path / "policy.py")
+    faithful = compare_closed_form(model, NumpyPlayer(tmp_path / "policy.py"), env, 100)
+    assert faithful.share < 0.05
+    assert "closed form: actions differ" in str(faithful)
+    assert "WARNING" not in str(faithful)
+    unlike = faithful._replace(half_range=1e-3 * faithful.half_range)
+    assert "WARNING: the closed form does not act as this agent does" in str(unlike)
 
 
 def test_the_numpy_module_imports_numpy_alone(pendulum: tuple[TBCHRL, ExportedPolicy], tmp_path: Path) -> None:
