@@ -1,12 +1,14 @@
 """The level's policy: SB3's calls, the stepwise interface, bounds and the blocks of flat storage."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from sb3_tbc.errors import ConfigError
+from sb3_tbc import TBCHRL
+from sb3_tbc.errors import ConfigError, NonFiniteError
 from sb3_tbc.tbc_hrl.policies import LevelPolicy
 
 OBSERVATIONS = spaces.Box(-np.inf, np.inf, (6,), np.float32)
@@ -116,3 +118,19 @@ def test_activation_is_used() -> None:
     policy = make_policy(activation_fn=nn.Tanh)
     assert isinstance(policy.actor.activation, nn.Tanh)
     assert isinstance(policy.critic.activation, nn.Tanh)
+
+
+@pytest.mark.parametrize("circuit", [True, False])
+def test_what_is_not_finite_is_named_while_acting(circuit: bool) -> None:
+    low = {"policy_kwargs": {"ndbc": {**NDBC, "input_scale": None} if circuit else None}}
+    env = gym.make("sb3_tbc/Pendulum-v0")
+    model = TBCHRL("MultiInputPolicy", env, seed=0, compile=False, low=low)
+    observation, _ = env.reset(seed=0)
+    _, state = model.predict(observation, None, deterministic=True)
+    _, state = model.predict(observation, state, deterministic=True)
+    broken = {**observation, "observation": np.full(3, np.nan, np.float32)}
+    with pytest.raises(NonFiniteError, match="high level, subgoal or time budget"):
+        model.predict(broken, None, deterministic=True)
+    state = (state[0], np.full(1, 50.0), *state[2:])
+    with pytest.raises(NonFiniteError, match="low level, sensory layer, step 2" if circuit else "low level, step 2"):
+        model.predict(broken, state, deterministic=True)

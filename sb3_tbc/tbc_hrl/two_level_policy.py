@@ -10,10 +10,13 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.layout import GOAL_KEYS, LevelLayout
+from sb3_tbc.ndbc.diagnostics import check_finite
 from sb3_tbc.options import OptionRules
 from sb3_tbc.spaces import FloatArray
 from sb3_tbc.tbc_hrl.level import SACLevel
+from sb3_tbc.tbc_hrl.policies import NDBCActor
 from sb3_tbc.vec_env.hierarchical_vec_env import Schedule
 
 
@@ -85,6 +88,7 @@ class TBCPolicy(BasePolicy):
         :param deterministic: use the means of both levels, and the averaged actors where they are kept
         :return: actions in the environment's units, and the new state
         :raises ValueError: if the observation is not that of a goal environment
+        :raises NonFiniteError: if a level answers with NaN
         """
         batch, single = self._as_batch(observation)
         n = len(batch["observation"])
@@ -96,6 +100,8 @@ class TBCPolicy(BasePolicy):
         remaining = self.rules.remaining(now.time_budget - now.elapsed)
         seen = self.layout.low(batch, now.subgoal, remaining)
         unit, membrane = self._levels[1].act(seen, now.membrane, deterministic, self.rng, average=deterministic)
+        if not np.isfinite(unit).all():
+            self._name_non_finite(seen, membrane, unit, now.elapsed)
         actions = self._unscale(unit)
         after = now._replace(elapsed=now.elapsed + 1, membrane=membrane)
         return (actions[0] if single else actions), cast("tuple[NDArray[Any], ...]", after)
@@ -118,6 +124,8 @@ class TBCPolicy(BasePolicy):
             unit, _ = self._levels[0].act(
                 self.layout.high(seen), no_state, deterministic, self.rng, average=deterministic
             )
+            if not np.isfinite(unit).all():
+                raise NonFiniteError(f"high level, subgoal or time budget {unit.tolist()} for observation {seen}")
             unit = unit.astype(np.float64)  # as while learning: a rounding error can change the length of a window
             if self.schedule is not None:
                 unit = self.schedule(unit, seen)
@@ -125,6 +133,16 @@ class TBCPolicy(BasePolicy):
             now.time_budget[where] = self.rules.budget(unit[:, -1])
             now.elapsed[where] = 0
             now.used[where] += 1
+
+    def _name_non_finite(
+        self, seen: FloatArray, membrane: FloatArray, unit: FloatArray, elapsed: NDArray[np.int64]
+    ) -> None:
+        """Raise, naming where the low level stopped being finite; steps count from the beginning of the option."""
+        row = int(np.flatnonzero(~np.isfinite(unit).all(axis=1))[0])
+        actor, step, one = self.low_policy.actor, int(elapsed[row]), slice(row, row + 1)
+        if isinstance(actor, NDBCActor):
+            check_finite(actor.net.wiring, seen[one], membrane[one], unit[one], "low", step)
+        raise NonFiniteError(f"low level, step {step}: action {unit[row].tolist()} for inputs {seen[row].tolist()}")
 
     def _as_batch(self, observation: Any) -> tuple[dict[str, NDArray[Any]], bool]:
         if not isinstance(observation, dict) or any(key not in observation for key in GOAL_KEYS):
