@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shutil
+import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +31,16 @@ TABLE_A1 = {
     "Pendulum": (6, 6, 1, 3, 4, 1, 4),
     "Platforms": (6, 6, 1, 4, 5, 3, 5),
 }
-"""inter, command, motor, sensory fan-out, inter fan-out, recurrent command synapses, motor fan-in."""
+WIRING_NUMBERS = (
+    "inter",
+    "command",
+    "motor",
+    "sensory_fanout",
+    "inter_fanout",
+    "recurrent_command_synapses",
+    "motor_fanin",
+)
+"""What the numbers of table A1 are, in order."""
 
 Job = Callable[[], Any]
 
@@ -144,9 +156,11 @@ def cells(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
     if "ncps LTC, 6 unfolds" in both:
         figures["ltc_against_ndbc_k3"] = ratio(both, "ncps LTC, 6 unfolds", "NDBC K=3")
         lines += ["", f"LTC with 6 unfolds takes {figures['ltc_against_ndbc_k3']:.1f} times as long as NDBC, K = 3."]
+    more, figures["acting"] = acting(arguments.rounds)
+    lines += ["", more]
     if not arguments.no_growth:
-        more, figures["growth"] = growth(arguments.batch, max(3, arguments.rounds // 4))
-        lines += ["", *more]
+        grown, figures["growth"] = growth(arguments.batch, max(3, arguments.rounds // 4))
+        lines += ["", *grown]
     return lines, figures
 
 
@@ -196,14 +210,74 @@ def growth(batch: int, rounds: int) -> tuple[list[str], dict[str, Any]]:
     figures: dict[str, Any] = {}
     for what, parts in jobs.items():
         seconds = in_turns({str(size): job for size, job in parts.items()}, rounds)
-        sizes = np.array(list(parts), dtype=float)
-        times = np.array([1e3 * min(seconds[str(size)]) for size in parts])
-        rest = times - np.polyval(np.polyfit(sizes, times, 1), sizes)
-        r2 = 1.0 - float((rest**2).sum() / ((times - times.mean()) ** 2).sum())
-        figures[what] = {"sizes": sizes.tolist(), "ms": times.tolist(), "r2": r2}
-        pairs = ", ".join(f"{size:g}: {ms:.2f}" for size, ms in zip(sizes, times, strict=True))
-        lines.append(f"* {what}: {pairs} (R2 {r2:.3f})")
+        line, figures[what] = _straight_line(what, {size: 1e3 * min(seconds[str(size)]) for size in parts}, "ms")
+        lines.append(line)
+    in_c = exported_steps()
+    if in_c:
+        line, figures["synapses_in_c"] = _straight_line("synapses, one step of the exported C file, us", in_c, "us")
+        lines.append(line)
     return lines, figures
+
+
+def _straight_line(what: str, times: Mapping[int, float], unit: str) -> tuple[str, dict[str, Any]]:
+    """A line of text and the figures of one curve, with the share of variance that a straight line explains."""
+    x, y = np.array(list(times), dtype=float), np.array(list(times.values()))
+    rest = y - np.polyval(np.polyfit(x, y, 1), x)
+    r2 = 1.0 - float((rest**2).sum() / ((y - y.mean()) ** 2).sum())
+    pairs = ", ".join(f"{size}: {value:.2f}" for size, value in times.items())
+    return f"* {what}: {pairs} (R2 {r2:.3f})", {"sizes": x.tolist(), unit: y.tolist(), "r2": r2}
+
+
+def _small_agent(task: str, numbers: Sequence[int]) -> tuple[Any, Any]:
+    """An untrained agent of a task with a circuit of these numbers, and the task."""
+    import gymnasium as gym
+
+    import sb3_tbc.tasks
+    from sb3_tbc.tbc_hrl import TBCHRL
+
+    sb3_tbc.tasks.register_tasks()
+    env = gym.make(f"sb3_tbc/{task}-v0")
+    circuit = {"policy_kwargs": {"ndbc": dict(zip(WIRING_NUMBERS, numbers, strict=True))}}
+    return TBCHRL("MultiInputPolicy", env, seed=0, compile=False, low=circuit), env
+
+
+def exported_steps() -> dict[int, float]:
+    """Microseconds of one low-level step in C by number of synapses; empty without a C compiler."""
+    if shutil.which("cc") is None:
+        return {}
+    from sb3_tbc.export_c import to_c
+    from sb3_tbc.export_check import CPlayer
+    from sb3_tbc.export_policy import extract
+
+    times = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for size in (1, 2, 4, 8):
+            model, _ = _small_agent("Pendulum", (6 * size, 6 * size, size, 3 * size, 4, 1, 4))
+            policy, path = extract(model), Path(folder) / f"policy{size}.c"
+            path.write_text(to_c(policy), encoding="utf-8")
+            net = model.low.policy.average_actor.net
+            times[net.wiring.n_synapses] = 1e6 * CPlayer(path, policy).low_step_seconds()
+    return times
+
+
+def acting(rounds: int) -> tuple[str, dict[str, float]]:
+    """Single deterministic steps of AntFourRooms' agent: the circuit, the low level around it, and ``predict``."""
+    model, env = _small_agent("AntFourRooms", TABLE_A1["AntFourRooms"])
+    circuit, rng = FrozenNDBC(model.low.policy.average_actor.net), np.random.default_rng(0)
+    observation, _ = env.reset(seed=0)
+    _, state = model.predict(observation, None, deterministic=True)
+    x, potentials = np.zeros((1, circuit.net.n_inputs), np.float32), np.zeros((1, circuit.state_dim), np.float32)
+    jobs: dict[str, Job] = {
+        "circuit": lambda: circuit(x, potentials),
+        "low level": lambda: model.low.act(x, potentials, True, rng, average=True),
+        "predict": lambda: model.predict(observation, state, deterministic=True),
+    }
+    figures = {name: 1e6 * min(times) for name, times in in_turns(jobs, rounds, calls=200).items()}
+    text = (
+        f"AntFourRooms, K = 3, one step: circuit {figures['circuit']:.1f} us, low level with bounds and squashing "
+        f"{figures['low level']:.1f} us, predict with options and checks {figures['predict']:.1f} us."
+    )
+    return text, figures
 
 
 def parameters() -> tuple[list[str], dict[str, Any]]:
