@@ -97,7 +97,11 @@ def _circuit(c: Circuit) -> str:
     sensory, currents = c.from_inputs[:inputs], c.from_inputs[inputs:]
     sizes = {"SENSORY": inputs, "INTER": inter, "PRESYNAPTIC": len(c.gain), "SUB_STEPS": c.sub_steps}
     text = "".join(f"#define TBC_{name} {size}\n" for name, size in sizes.items())
-    text += _indices("relaxation_order", np.concatenate(c.order))
+    order = np.concatenate(c.order)
+    turn = np.argsort(order)
+    early = [j for j, heard in enumerate(c.recurrent[:, n:] != 0) if (turn[:n][heard] <= turn[j]).any()]
+    text += f"#define TBC_LOOPS {len(early)}\n" + _indices("heard_early", np.array(early, dtype=int))
+    text += _indices("relaxation_order", order)
     input_gain = c.input_gain.astype(np.float64)
     text += exact("sensory_gain", c.sensory_gain * input_gain) + array("sensory_threshold", c.sensory_threshold)
     text += array("gain", c.gain) + array("threshold", c.threshold)

@@ -300,7 +300,7 @@ class Cortex(NamedTuple):
     """Bytes on a Cortex-M4 of the low level alone."""
 
     flash: int  # code and constants, without the mathematical library
-    library: int  # expf, tanhf, expm1f, as linked
+    library: int  # expf and tanhf, as linked
     stack: int
     state: int
 

@@ -57,12 +57,14 @@ static void circuit_integrate(tbc_real *v, const tbc_real *weighted, const tbc_r
     }
 }
 
-/* V(t) = (V0 - A) exp(-(w_tau + f) t) + A, each neuron hearing where those before it have come to. */
+/* V(t) = (V0 - A) exp(-(w_tau + f) t) + A, each neuron hearing where those before it have come to, and where a
+ * loop is opened, where the others were. */
 static void circuit_relax(tbc_real *v, const tbc_real *weighted, const tbc_real *total)
 {
-    tbc_real released[TBC_PRESYNAPTIC];
+    tbc_real released[TBC_PRESYNAPTIC] = {0};
     int i, k;
-    for (i = 0; i < TBC_PRESYNAPTIC; ++i) {
+    for (k = 0; k < TBC_LOOPS; ++k) {
+        i = heard_early[k];
         released[i] = logistic(gain[i] * v[i] - threshold[i]);
     }
     for (k = 0; k < TBC_STATE; ++k) {
@@ -71,7 +73,7 @@ static void circuit_relax(tbc_real *v, const tbc_real *weighted, const tbc_real 
         w = weighted[i];
         g = total[i];
         circuit_receive(i, released, &w, &g);
-        v[i] -= (w / g - v[i]) * TBC_EXPM1(-g / capacitance[i]);
+        v[i] = w / g + (v[i] - w / g) * TBC_EXP(-g / capacitance[i]);
         if (i < TBC_PRESYNAPTIC) {
             released[i] = logistic(gain[i] * v[i] - threshold[i]);
         }

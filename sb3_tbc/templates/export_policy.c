@@ -47,11 +47,9 @@ void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT]
 
 #ifdef TBC_SINGLE
 #define TBC_EXP expf
-#define TBC_EXPM1 expm1f
 #define TBC_TANH tanhf
 #else
 #define TBC_EXP exp
-#define TBC_EXPM1 expm1
 #define TBC_TANH tanh
 #endif
 
