@@ -122,6 +122,9 @@ class OptionClock:
     :param rules: what ends an option
     """
 
+    fields = ("unit_action", "subgoal", "time_budget", "testing", "elapsed", "used")
+    """The arrays that hold its state, one row per environment."""
+
     def __init__(self, n_envs: int, subgoal_dim: int, rules: OptionRules) -> None:
         self.rules = rules
         self.unit_action = np.zeros((n_envs, subgoal_dim + 1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from sb3_tbc.hindsight import (
 from sb3_tbc.layout import LevelLayout
 from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import Episode, OptionRules
-from sb3_tbc.spaces import FloatArray
+from sb3_tbc.spaces import FloatArray, GoalObservation
 from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.tbc_hrl.replay import Replay
 from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal, Schedule
@@ -78,8 +78,25 @@ class Collector:
         self.high, self.low, self.rng, self.unscale = high, low, rng, unscale
         self.exploration = exploration
         self.env = HierarchicalVecEnv(venv, self.propose, layout, rules, low.state_dim, schedule)
-        self.membrane = np.zeros((venv.num_envs, low.state_dim), dtype=np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin new episodes."""
+        self.membrane: FloatArray = np.zeros((self.env.num_envs, self.low.state_dim), dtype=np.float32)
         self.observation: FloatArray = self.env.reset()
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Live options, running episodes and memory, as plain arrays."""
+        return {**self.env.get_state(), "membrane": self.membrane, "observation": self.observation}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]], observation: GoalObservation) -> bool:
+        """Take over what :meth:`get_state` gave; False if what the environments show does not belong to it.
+
+        :param observation: what the environments show now
+        """
+        seen = self.env.set_state(state, observation)
+        self.membrane, self.observation = state["membrane"].astype(np.float32), seen
+        return np.array_equal(seen, state["observation"])
 
     def step(self) -> list[dict[str, Any]]:
         """One step of every environment; the infos it gave."""

@@ -15,7 +15,7 @@ class EpisodeDiagnostics:
     """Collects per-episode figures of both levels and gives their means."""
 
     def __init__(self) -> None:
-        self._values: dict[str, list[float]] = defaultdict(list)
+        self.values: dict[str, list[float]] = defaultdict(list)
 
     def add(self, episode: Episode, steps: HighLevelSteps) -> None:
         """Take in a finished episode and the transitions made of it."""
@@ -30,10 +30,10 @@ class EpisodeDiagnostics:
             "high/goal_reached_share": np.mean(steps.dones),
         }
         for name, value in values.items():
-            self._values[name].append(float(value))
+            self.values[name].append(float(value))
 
     def drain(self) -> dict[str, float]:
         """Means since the last call, by log name."""
-        means = {name: float(np.mean(values)) for name, values in self._values.items()}
-        self._values.clear()
+        means = {name: float(np.mean(values)) for name, values in self.values.items()}
+        self.values.clear()
         return means

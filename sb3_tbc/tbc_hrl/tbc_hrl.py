@@ -25,6 +25,7 @@ from sb3_tbc.layout import LevelLayout, check_goal_space
 from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import OptionRules
 from sb3_tbc.spaces import SubgoalSpace
+from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, Exploration, goal_test_of
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.level import SACLevel
@@ -170,6 +171,8 @@ class TBCHRL(BaseAlgorithm):
         self.subgoals, self.relative_subgoals = subgoals, relative_subgoals
         self._n_updates = 0
         self._updated_at = 0
+        self.collector: Collector | None = None
+        self._resumed: dict[str, Any] = {}
         if _init_setup_model:
             self._setup_model()
 
@@ -311,7 +314,8 @@ class TBCHRL(BaseAlgorithm):
         progress_bar: bool = False,
     ) -> SelfTBCHRL:
         """Collect whole episodes, then update both levels in a burst, until ``total_timesteps`` steps are done."""
-        self._prepare_updates(total_timesteps)
+        resumed, self._resumed = {} if reset_num_timesteps else self._resumed, {}
+        self._prepare_updates(total_timesteps + (self.num_timesteps if resumed else 0))
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -321,7 +325,7 @@ class TBCHRL(BaseAlgorithm):
             self._updated_at = 0
         for level in (self.high, self.low):
             level.set_logger(self.logger)
-        collector = Collector(
+        self.collector = collector = Collector(
             self.env,
             self.high,
             self.low,
@@ -332,6 +336,8 @@ class TBCHRL(BaseAlgorithm):
             self.policy._unscale,
             self.schedule,
         )
+        if resumed:
+            resume.set_state(self, collector, resumed)
         callback.on_training_start(locals(), globals())
         while self.num_timesteps < total_timesteps:
             if not self.collect_rollouts(collector, callback, total_timesteps):
@@ -413,7 +419,7 @@ class TBCHRL(BaseAlgorithm):
         return [
             *super()._excluded_save_params(),
             "high", "low", "rng", "layout", "rules", "high_reward", "low_level_reward", "store", "diagnostics",
-            "replay_buffer", "schedule", "rule", "reachability",
+            "replay_buffer", "schedule", "rule", "reachability", "collector", "_resumed",
         ]  # fmt: skip
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
@@ -433,8 +439,12 @@ class TBCHRL(BaseAlgorithm):
             level.refresh()
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """Write both levels' replay buffers to one file of plain arrays, atomically."""
-        self.replay_buffer.save(path)
+        """Write both levels' replay buffers, and all else that learning goes on from, to one file of plain arrays.
+
+        A model saved at the same moment (between two rollouts), loaded together with this file, goes on learning with
+        ``learn(..., reset_num_timesteps=False)`` as if it had never stopped, bit for bit.
+        """
+        self.replay_buffer.save(path, resume.get_state(self))
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what :meth:`save_replay_buffer` wrote; only plain arrays are read, never pickled objects.
@@ -442,4 +452,4 @@ class TBCHRL(BaseAlgorithm):
         :param truncate_last_traj: for SB3's sake; unfinished episodes are never in the buffers
         :raises ValueError: if the file was written for other spaces or sizes
         """
-        self.replay_buffer.load(path)
+        self._resumed = self.replay_buffer.load(path)

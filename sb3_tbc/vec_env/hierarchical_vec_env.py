@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,6 +91,26 @@ class HierarchicalVecEnv(VecEnvWrapper):
         observation: GoalObservation = self.venv.reset()  # type: ignore[assignment]
         self._begin_episodes(self._everywhere, observation)
         self._begin_options(self._everywhere, observation)
+        self._started = True
+        return self._low_observation(observation)
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """Live options and running episodes, as plain arrays; the environments themselves are not among them."""
+        recorded = {f"recorder.{name}": array for name, array in self._recorder.get_state().items()}
+        return {**recorded, **{f"clock.{name}": getattr(self.clock, name).copy() for name in self.clock.fields}}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]], observation: GoalObservation) -> FloatArray:
+        """Take over what :meth:`get_state` gave, and go on from there.
+
+        :param observation: what the environments show now
+        :return: what the low level sees
+        """
+        parts = {name.partition("."): array for name, array in state.items()}
+        self._recorder.set_state({name: x for (owner, _, name), x in parts.items() if owner == "recorder"})
+        for (owner, _, name), array in parts.items():
+            if owner == "clock":
+                getattr(self.clock, name)[:] = array
+        self.episodes = []
         self._started = True
         return self._low_observation(observation)
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.options import Episode, Option
+from sb3_tbc.options import Episode, Option, TerminationReason
 from sb3_tbc.spaces import FloatArray, GoalObservation
+
+REASONS = tuple(TerminationReason)
 
 
 class EpisodeRecorder:
@@ -68,6 +71,38 @@ class EpisodeRecorder:
             terminated=terminated,
             success=success,
         )
+
+    def get_state(self) -> dict[str, NDArray[Any]]:
+        """What was recorded of the running episodes, as plain arrays."""
+        rows = int(self.steps.max()) + 1
+        held = {name: array[:, :rows].copy() for name, array in self._data.items()}
+        options = [
+            [index, o.start, o.duration, o.time_budget, o.testing, o.reached, REASONS.index(o.reason), *o.unit_action,
+             *o.subgoal]
+            for index, begun in enumerate(self.options) for o in begun
+        ]  # fmt: skip
+        packed = np.array(options, dtype=np.float64).reshape(len(options), -1 if options else 0)
+        return {**held, "steps": self.steps.copy(), "rewards": self._rewards[:, :rows].copy(), "options": packed}
+
+    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+        """Take over what :meth:`get_state` gave."""
+        self.steps[:] = state["steps"]
+        rows = state["rewards"].shape[1]
+        while self._rewards.shape[1] < rows:
+            self._grow()
+        self._rewards[:, :rows] = state["rewards"]
+        for name, array in self._data.items():
+            array[:, :rows] = state[name]
+        self.options = [[] for _ in range(self.n_envs)]
+        for index, start, duration, budget, testing, reached, reason, *rest in state["options"].tolist():
+            n = len(rest) // 2 + 1  # the unit action has the time budget besides the subgoal
+            action, subgoal = np.array(rest[:n]), np.array(rest[n:])
+            self.options[int(index)].append(
+                Option(
+                    int(start), int(duration), action, subgoal, budget, bool(testing), bool(reached),
+                    REASONS[int(reason)],
+                )
+            )  # fmt: skip
 
     def _now(self) -> tuple[Any, Any]:
         """Index of every environment's present row; a slice where there is one, which is several times as fast."""

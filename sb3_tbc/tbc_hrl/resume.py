@@ -1,0 +1,94 @@
+"""What a run needs besides weights and replay to go on, bit for bit, as if it had never been interrupted."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.tbc_hrl.collection import Collector
+from sb3_tbc.tbc_hrl.policies import NDBCActor
+from sb3_tbc.vec_env.goal_vec_env import GoalVecEnv, RunningEpisode
+
+if TYPE_CHECKING:
+    from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
+
+logger = logging.getLogger(__name__)
+Arrays = dict[str, NDArray[Any]]
+
+
+def generators(model: TBCHRL) -> dict[str, np.random.Generator]:
+    """Every source of randomness that learning draws from."""
+    found = {
+        "agent": model.rng,
+        "policy": model.policy.rng,
+        "high.noise": model.high.noise_rng,
+        "low.noise": model.low.noise_rng,
+        "high.replay": model.replay_buffer.high.rng,
+        "low.replay": model.replay_buffer.low.rng,
+    }
+    if model.reachability is not None:
+        found["reachability"] = model.reachability.rng
+    return found
+
+
+def get_state(model: TBCHRL) -> Arrays:
+    """Random streams, counters, live options and running episodes, as plain arrays."""
+    plain = {
+        "timesteps": int(model.num_timesteps),
+        "generators": {name: rng.bit_generator.state for name, rng in generators(model).items()},
+        "n_updates": [model.high._n_updates, model.low._n_updates],
+        "diagnostics": dict(model.diagnostics.values),
+    }
+    arrays: Arrays = {}
+    actor = model.low.policy.actor
+    if isinstance(actor, NDBCActor):
+        plain["circuit"] = {"updates": actor.net.updates, "sub_steps": actor.net.sub_steps}
+        arrays["direction"] = actor.net.lipschitz.direction.numpy().copy()
+    if model.collector is not None and isinstance(model.collector.env.venv, GoalVecEnv):
+        running = model.collector.env.venv.running
+        plain["episodes"] = [{"seed": episode.seed, "generator": episode.generator} for episode in running]
+        arrays |= {f"actions.{i}": np.array(episode.actions) for i, episode in enumerate(running)}
+        arrays |= {f"collector.{name}": array for name, array in model.collector.get_state().items()}
+    return {**arrays, "plain": np.array(json.dumps(plain))}
+
+
+def set_state(model: TBCHRL, collector: Collector, state: Mapping[str, NDArray[Any]]) -> bool:
+    """Go on where :func:`get_state` was taken; False if the state is of another moment, and nothing was changed.
+
+    Where the environments cannot be brought back to where they were, everything else goes on and they begin new
+    episodes, which the log says.
+    """
+    plain = json.loads(str(state["plain"])) if "plain" in state else {}
+    if plain.get("timesteps") != model.num_timesteps:
+        return False
+    _relive(collector, plain, state)
+    for name, rng in generators(model).items():
+        if name in plain["generators"]:
+            rng.bit_generator.state = plain["generators"][name]
+    model.high._n_updates, model.low._n_updates = plain["n_updates"]
+    model.diagnostics.values.clear()
+    model.diagnostics.values.update(plain["diagnostics"])
+    actor = model.low.policy.actor
+    if isinstance(actor, NDBCActor) and "circuit" in plain:
+        actor.net.updates, actor.net.sub_steps = plain["circuit"]["updates"], plain["circuit"]["sub_steps"]
+        actor.net.lipschitz.direction.copy_(actor.net.lipschitz.direction.new_tensor(state["direction"]))
+        model.low.refresh()
+    return True
+
+
+def _relive(collector: Collector, plain: Mapping[str, Any], state: Mapping[str, NDArray[Any]]) -> None:
+    venv, starts = collector.env.venv, plain.get("episodes", [])
+    if not isinstance(venv, GoalVecEnv) or len(starts) != venv.num_envs:
+        logger.warning("the environments begin new episodes: what ran in them when the run was saved is not known")
+        return
+    running = [RunningEpisode(**start, actions=list(state[f"actions.{i}"])) for i, start in enumerate(starts)]
+    observation = venv.relive(running)
+    held = {name.partition(".")[2]: array for name, array in state.items() if name.startswith("collector.")}
+    if not collector.set_state(held, observation):
+        logger.warning("the environments begin new episodes: living through the saved ones led elsewhere")
+        collector.reset()
