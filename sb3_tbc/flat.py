@@ -17,7 +17,9 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEn
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.sac.policies import MultiInputPolicy
 
+from sb3_tbc.hindsight import check_goal_strategy
 from sb3_tbc.ring_buffer import write_arrays
+from sb3_tbc.tbc_hrl.settings import attribute_of
 
 CYCLE = 100
 """Environment steps between two bursts of updates."""
@@ -27,7 +29,31 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
     """SB3's hindsight replay for tasks that end on success: a relabelled transition that meets its goal is terminal.
 
     SB3 keeps the flag that was stored, under which the value of standing on a relabelled goal never stops to grow.
+
+    :param event_goals: take the goal from the step of the task's event (:attr:`SubgoalSpace.event`) for all transitions
+        of an episode in which it happened, and leave those of the others as they are
+    :param kwargs: see SB3
     """
+
+    def __init__(self, *args: Any, event_goals: bool = False, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.event_goals = event_goals
+
+    def _sample_goals(self, batch_indices: NDArray[Any], env_indices: NDArray[Any]) -> NDArray[Any]:
+        if not self.event_goals or self.env is None:
+            return super()._sample_goals(batch_indices, env_indices)
+        event = attribute_of(self.env, "subgoals").event
+        starts, lengths = (a[batch_indices, env_indices, None] for a in (self.ep_start, self.ep_length))
+        ahead = np.arange(lengths.max())
+        rows = (starts + ahead) % self.buffer_size
+        happened = (self.next_observations["observation"][rows, env_indices[:, None], event] > 0.5) & (ahead < lengths)
+        first = rows[np.arange(len(rows)), happened.argmax(axis=1)]
+        goals: NDArray[Any] = np.where(
+            happened.any(axis=1, keepdims=True),
+            self.next_observations["achieved_goal"][first, env_indices],
+            self.observations["desired_goal"][batch_indices, env_indices],
+        )
+        return goals
 
     def _get_virtual_samples(
         self, batch_indices: NDArray[Any], env_indices: NDArray[Any], env: VecNormalize | None = None
@@ -49,9 +75,9 @@ class FlatSAC(SAC):
     :param env: a goal environment
     :param gradient_ratio: updates per environment step, done every 100 steps
     :param n_hindsight_goals: relabelled samples per plain one
-    :param goal_strategy: ``"future"``, ``"episode"`` or ``"final"``, see SB3
+    :param goal_strategy: ``"future"``, ``"episode"`` or ``"final"``, see SB3, or ``"event"``, see the buffer
     :param kwargs: SAC's own parameters
-    :raises ValueError: if ``gradient_ratio`` is negative
+    :raises ValueError: if ``gradient_ratio`` is negative, or ``goal_strategy`` ``"event"`` on a task without one
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
@@ -72,7 +98,12 @@ class FlatSAC(SAC):
         if gradient_ratio < 0:
             raise ValueError(f"gradient_ratio must not be negative, got {gradient_ratio}")
         self.gradient_ratio = gradient_ratio
-        hindsight = {"n_sampled_goal": int(n_hindsight_goals), "goal_selection_strategy": goal_strategy}
+        by_event = goal_strategy == "event"
+        hindsight = {
+            "n_sampled_goal": int(n_hindsight_goals),
+            "goal_selection_strategy": "future" if by_event else goal_strategy,
+            "event_goals": by_event,
+        }
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,
@@ -84,6 +115,8 @@ class FlatSAC(SAC):
             _init_setup_model=False,
             **kwargs,
         )
+        if by_event and self.env is not None:
+            check_goal_strategy(goal_strategy, attribute_of(self.env, "subgoals"))
         if _init_setup_model:
             self._setup_model()
 

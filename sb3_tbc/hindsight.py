@@ -18,6 +18,24 @@ from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import Episode, OptionRules
 from sb3_tbc.spaces import FloatArray, SubgoalSpace
 
+GOAL_STRATEGIES = ("future", "episode", "event")
+"""Where the high level's hindsight goals come from."""
+
+
+def check_goal_strategy(strategy: str, subgoals: SubgoalSpace | None) -> None:
+    """See that hindsight goals can be chosen this way.
+
+    :param subgoals: the task's
+    :raises ValueError: if the strategy is unknown, or the task has no such event
+    """
+    if strategy not in GOAL_STRATEGIES:
+        raise ValueError(f"goal_strategy must be one of {', '.join(GOAL_STRATEGIES)}, got {strategy!r}")
+    if strategy == "event" and (subgoals is None or subgoals.event is None):
+        raise ValueError(
+            "goal_strategy 'event' takes goals from the step of a task's event, and this task names none: use 'future' "
+            "or 'episode', or give its SubgoalSpace the index of the event's flag in the observation"
+        )
+
 
 class GoalTest(NamedTuple):
     """A task's reward and termination as batched functions of ``(achieved_goal, desired_goal)``."""
@@ -163,7 +181,7 @@ class HindsightSettings(NamedTuple):
     """How much hindsight the high level uses."""
 
     n_goals: int  # goal copies per option
-    goal_strategy: str  # "future" or "episode"
+    goal_strategy: str  # "future", "episode" or "event"
     testing_penalty: float  # reward of a testing transition, negative
     keep_original: bool  # also store failed options as they were chosen (paper, algorithm 1 line 26)
     tolerance: float | None = None  # relabelled options further than this from where they ended are not a success
@@ -219,17 +237,20 @@ def _rows(episode: Episode, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
     }
 
 
-def goal_pairs(n_options: int, n_goals: int, strategy: str, rng: np.random.Generator) -> NDArray[np.int64]:
+def goal_pairs(
+    n_options: int, n_goals: int, strategy: str, rng: np.random.Generator, event: int | None = None
+) -> NDArray[np.int64]:
     """Rows ``(option, option whose outcome becomes its goal)`` for hindsight goal relabelling, ``(n, 2)``.
 
     ``"future"`` draws from the later options of the episode, never an option's own outcome (as HiTS and HAC);
-    ``"episode"`` from all of them.
+    ``"episode"`` from all of them; ``"event"`` gives every option one goal, the outcome of the option that the task's
+    event ended, and none in an episode without it (as HiTS in Tennis2D, whose goals hold at the second bounce alone).
 
-    :raises ValueError: if the strategy is unknown
+    :param event: the option that the event ended, None if there was none
     """
-    if strategy not in ("future", "episode"):
-        raise ValueError(f"goal_strategy must be 'future' or 'episode', got {strategy!r}")
     options = np.arange(n_options)
+    if strategy == "event":
+        return np.stack([options, np.full(n_options, event)], axis=1) if event is not None else np.zeros((0, 2), int)
     if strategy == "episode":
         pairs = np.repeat(options, min(n_goals, n_options))
         return np.stack([pairs, rng.integers(0, n_options, len(pairs))], axis=1)
@@ -302,7 +323,9 @@ def high_level_steps(
     every = np.flatnonzero(reached | changed | ~testing)  # a failed test without a hindsight action has its penalty
     gained = charged(rewards, actions) + bonus
     parts.append(steps(every, actions[every], gained[every], dones[every], durations[every], True))
-    pairs = goal_pairs(n, settings.n_goals, settings.goal_strategy, rng)
+    happened = np.flatnonzero(subgoals.happened(after))
+    event = int(happened[0]) if len(happened) else None
+    pairs = goal_pairs(n, settings.n_goals, settings.goal_strategy, rng, event)
     if len(pairs):
         goals = episode.achieved_goal[ends[pairs[:, 1]]]
         copies = relabel_goals(episode, starts[pairs[:, 0]], durations[pairs[:, 0]], goals, reward, goal_test)

@@ -18,6 +18,7 @@ class TerminationReason(enum.Enum):
     REACHED = "reached"
     EXPIRED = "expired"
     EPISODE_END = "episode_end"
+    EVENT = "event"
 
 
 @dataclass(frozen=True)
@@ -163,13 +164,15 @@ class OptionClock:
         """Whose time budget is spent, ``(n_envs,)``."""
         return np.asarray(self.elapsed >= self.time_budget)
 
-    def close(self, index: int, step: int, reached: bool, episode_over: bool) -> Option:
+    def close(self, index: int, step: int, reached: bool, episode_over: bool, event: bool = False) -> Option:
         """The option of environment ``index`` as a record; ``step`` is the number of steps of its episode so far."""
         expired = bool(self.elapsed[index] >= self.time_budget[index])
         if expired:
             reason = TerminationReason.REACHED if reached else TerminationReason.EXPIRED
         elif episode_over:
             reason = TerminationReason.EPISODE_END
+        elif event:
+            reason = TerminationReason.EVENT
         else:
             reason = TerminationReason.REACHED
         duration = int(self.elapsed[index])
@@ -180,7 +183,7 @@ class OptionClock:
             subgoal=self.subgoal[index].copy(),
             time_budget=float(self.time_budget[index]),
             testing=bool(self.testing[index]),
-            # an option that the end of the episode cut off did not get to show whether it reaches its subgoal
-            reached=reached and reason is not TerminationReason.EPISODE_END,
+            # an option that was cut off did not get to show whether it reaches its subgoal
+            reached=reached and reason is TerminationReason.REACHED,
             reason=reason,
         )

@@ -27,6 +27,9 @@ class SubgoalSpace:
     :param names: a name for each coordinate
     :param groups: coordinate groups whose Euclidean distance is compared with a threshold; by default each
         coordinate is a group of its own
+    :param event: index into the task's ``observation`` of a flag that is 1 in just the step of a decisive event, at
+        which control returns to the high level and which gives the goal of hindsight where ``goal_strategy`` is
+        ``"event"``; None where the task has no such event
     :raises ValueError: if bounds, thresholds and groups do not fit together
     """
 
@@ -40,6 +43,7 @@ class SubgoalSpace:
         local_scale: ArrayLike,
         names: Sequence[str],
         groups: Sequence[Sequence[int]] | None = None,
+        event: int | None = None,
     ) -> None:
         self.low = np.asarray(low, dtype=np.float64)
         self.high = np.asarray(high, dtype=np.float64)
@@ -51,6 +55,7 @@ class SubgoalSpace:
         )
         self._achieved = achieved
         self._local = local
+        self.event = event
         self._check()
 
     def _check(self) -> None:
@@ -102,6 +107,12 @@ class SubgoalSpace:
             return np.asarray((np.abs(difference) < self.thresholds).all(axis=-1))
         distances = np.stack([np.linalg.norm(difference[..., list(g)], axis=-1) for g in self.groups], axis=-1)
         return np.asarray((distances < self.thresholds).all(axis=-1))
+
+    def happened(self, observation: GoalObservation) -> NDArray[np.bool_]:
+        """Whether the decisive event happened in the step that led to ``observation``, ``(...)``; never without one."""
+        if self.event is None:
+            return np.zeros(observation["observation"].shape[:-1], dtype=bool)
+        return np.asarray(observation["observation"][..., self.event] > 0.5)
 
     def scale(self, subgoal: FloatArray) -> FloatArray:
         """From task units to [-1, 1] coordinates."""

@@ -23,6 +23,8 @@ JOINT_SCALE = (0.7 * math.pi * 1.3, 0.7 * math.pi * 1.3, 0.3 * math.pi * 1.3)
 LANDING_CENTRE, LANDING_SCALE = 3.0, 3.0
 TOLERANCE = 0.4
 NATIVE_DIM = 14
+SECOND_BOUNCE = 3
+"""Index of the flag in the observation."""
 
 
 class Tennis2D(GoalTask):
@@ -37,7 +39,8 @@ class Tennis2D(GoalTask):
     * Goal (4): ((ball x - 3) / 3, bounced, bouncing for the second time, bounced twice); desired (u, 1, 1, 1) with u in
       [0, 1]. Success: the flags agree and the ball is within 0.4 m, so only in the step of the second bounce.
     * Start: arm at (45, -90, 0) degrees; the shot's height, speed, angle and spin are random; 500 steps.
-    * Subgoals (6): joint angles and velocities in [-1, 1], thresholds 0.2; the low level sees only these.
+    * Subgoals (6): joint angles and velocities in [-1, 1], thresholds 0.2; the low level sees only these. The second
+      bounce is an event: it returns control to the high level, and it alone can give hindsight goals.
 
     Mended (unless ``legacy_quirks=True``): the shot's spin never reaches the ball, which keeps the spin of the episode
     before; solver impulses survive a reset; success does not end the episode; rounding adds a 501st step.
@@ -73,6 +76,7 @@ class Tennis2D(GoalTask):
             local=_robot,
             local_scale=np.ones(6),
             names=tuple(f"joint_{i}_{what}" for i in range(3) for what in ("angle", "angular_vel")),
+            event=SECOND_BOUNCE,
         )
         return np.ones(30 if self.layout == "paper" else NATIVE_DIM), np.ones(4), subgoals
 

@@ -84,16 +84,18 @@ def test_peers_settings_where_the_paper_is_silent(task: str) -> None:
             if "target_entropy" in peer:
                 assert ours["target_entropy"] == peer["target_entropy"]
             strategy = ours.get("goal_strategy", model["goal_strategy"])
-            assert strategy == peer["goal_sampling_strategy"] or peer["goal_sampling_strategy"] == "Tennis2DGSS"
+            assert strategy == {"Tennis2DGSS": "event"}.get(*[peer["goal_sampling_strategy"]] * 2)
         if algo == "hac":
             assert model["max_options"] == levels[1]["max_n_actions"]
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_wiring_is_table_a1(task: str) -> None:
-    for config in ("paper", "tuned"):
-        ndbc = load_config("tbc-hrl", task, config).model["low"]["policy_kwargs"]["ndbc"]
-        assert {k: ndbc[k] for k in TABLES["table_a1_ndbcnet"][task]} == TABLES["table_a1_ndbcnet"][task]
+    table = TABLES["table_a1_ndbcnet"][task]
+    paper, tuned = (load_config("tbc-hrl", task, c).model["low"]["policy_kwargs"]["ndbc"] for c in ("paper", "tuned"))
+    assert {k: paper[k] for k in table} == table
+    layers = ("inter", "command", "motor")  # `tuned` may depart in the fans
+    assert {k: tuned[k] for k in layers} == {k: table[k] for k in layers}
 
 
 def test_paper_reading_of_the_window_end() -> None:

@@ -13,6 +13,7 @@ from sb3_tbc.hindsight import (
     GoalTest,
     HighLevelReward,
     HindsightSettings,
+    check_goal_strategy,
     goal_pairs,
     high_level_steps,
     hindsight_success,
@@ -85,7 +86,7 @@ def test_goal_pairs_never_use_an_options_own_outcome_nor_the_past() -> None:
     anywhere = goal_pairs(4, 3, "episode", np.random.default_rng(0))
     assert np.bincount(anywhere[:, 0]).tolist() == [3, 3, 3, 3]
     with pytest.raises(ValueError, match="final"):
-        goal_pairs(4, 3, "final", np.random.default_rng(0))
+        check_goal_strategy("final", ENV.subgoals)
 
 
 def test_relabelled_goal_met_inside_a_window_ends_it_there() -> None:

@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
-from sb3_tbc.hindsight import HighLevelReward, HindsightSettings
+from sb3_tbc.hindsight import HighLevelReward, HindsightSettings, check_goal_strategy
 from sb3_tbc.layout import LevelLayout, check_goal_space
 from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import OptionRules
@@ -76,7 +76,8 @@ class TBCHRL(BaseAlgorithm):
         it is relabelled with (the paper's success test: 0.05); None relabels them all
     :param random_fraction: share of uniformly random actions on each level while exploring
     :param n_hindsight_goals: hindsight goals per transition
-    :param goal_strategy: where the high level's hindsight goals come from, ``"future"`` or ``"episode"``
+    :param goal_strategy: where the high level's hindsight goals come from: ``"future"`` or ``"episode"``, later or any
+        options of the episode, or ``"event"``, the option that the task's event ended
     :param gradient_ratio: updates of each level per environment step, done in bursts after episodes
     :param learning_starts: environment steps before the first update
     :param memory: when the membrane is reset: ``"window"``, ``"episode"`` or ``"none"`` (every step)
@@ -273,6 +274,7 @@ class TBCHRL(BaseAlgorithm):
             )
         if self.subgoals is None:
             self.subgoals = attribute_of(env, "subgoals")
+        check_goal_strategy(self.goal_strategy, self.subgoals)
         achieved_in_observation = attribute_of(env, "achieved_in_observation")
         self.achieved_in_observation = True if achieved_in_observation is None else bool(achieved_in_observation)
         if self.dt_max == -1:

@@ -111,7 +111,7 @@ class TBCPolicy(BasePolicy):
     ) -> None:
         """Replace the options that are over, in place."""
         now.used[starts] = 0
-        over = starts | (now.elapsed >= now.time_budget)
+        over = starts | (now.elapsed >= now.time_budget) | (self.layout.subgoals.happened(batch) & (now.elapsed > 0))
         if self.rules.window_end == "reached":
             reached = self.layout.subgoals.reached(self.layout.subgoals.achieved(batch), now.subgoal)
             over |= reached & (now.elapsed >= self.rules.dt_min)

@@ -161,12 +161,14 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self, seen: GoalObservation, dones: NDArray[np.bool_]
     ) -> tuple[NDArray[np.bool_] | None, NDArray[np.bool_]]:
         """Which subgoals are reached (``None``: not looked at, no window can end by it) and which windows end."""
-        expired = self.clock.expired
+        ended = self.clock.expired | dones
+        if self.layout.subgoals.event is not None:
+            ended |= self.layout.subgoals.happened(seen)
         if self.rules.window_end == "timed":
-            return None, expired | dones
+            return None, ended
         reached = self._reached(seen, self._everywhere)
         early = reached & (self.clock.elapsed >= self.rules.dt_min)
-        return reached, expired | early | dones
+        return reached, ended | early
 
     def _reached(self, seen: GoalObservation, where: NDArray[np.intp]) -> NDArray[np.bool_]:
         subgoals = self.layout.subgoals
@@ -183,10 +185,11 @@ class HierarchicalVecEnv(VecEnvWrapper):
     ) -> FloatArray:
         """Record the options that end; the low level's reward of each."""
         reached_here = self._reached(seen, where) if reached is None else reached[where]
+        event = self.layout.subgoals.happened({key: seen[key][where] for key in GOAL_KEYS})
         rewards = np.zeros(len(where), dtype=np.float32)
         for row, index in enumerate(where):
             step = int(self._recorder.steps[index])
-            option = self.clock.close(index, step, bool(reached_here[row]), bool(dones[index]))
+            option = self.clock.close(index, step, bool(reached_here[row]), bool(dones[index]), bool(event[row]))
             self._recorder.options[index].append(option)
             infos[index]["option"] = option.as_info()
             rewards[row] = float(option.reached)

@@ -95,7 +95,7 @@ MODEL: Schema = {
     "relabel_tolerance": NUMBER,
     "random_fraction": NUMBER,
     "n_hindsight_goals": NUMBER,
-    "goal_strategy": frozenset({"future", "episode"}),
+    "goal_strategy": frozenset({"future", "episode", "event"}),
     "gradient_ratio": NUMBER,
     "learning_starts": int,
     "memory": frozenset({"window", "episode", "none"}),
