@@ -33,6 +33,8 @@ class SubgoalSpace:
     :raises ValueError: if bounds, thresholds and groups do not fit together
     """
 
+    event: int | None = None  # also of spaces in agents that were saved before there were events
+
     def __init__(
         self,
         low: ArrayLike,
