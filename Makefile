@@ -15,7 +15,7 @@ RUN := runs/$(shell date +%Y%m%d-%H%M%S)
 
 help:
 	@echo "install          .venv with the package (editable) and what its tests need"
-	@echo "train            train TBC-HRL, evaluate it, write a report [ENV= STEPS= SEED= ALGO=]"
+	@echo "train            train TBC-HRL, evaluate it, film it, write a report [ENV= STEPS= SEED= ALGO=]"
 	@echo "test             install, then the fast test suite"
 	@echo "pytest           the fast tests alone        pytest-slow  all tests"
 	@echo "type lint        mypy, ruff                  format       ruff format and fixes"
@@ -34,6 +34,7 @@ install: $(VENV)/.installed
 train: install
 	$(BIN)/python -m sb3_tbc.train --algo $(ALGO) --env $(ENV) --seed $(SEED) $(if $(STEPS),--n-timesteps $(STEPS)) \
 	    --log-folder $(RUN) --progress
+	-$(BIN)/python -m sb3_tbc.evaluate $(RUN)/*/*/*/*/model.zip --n-episodes 3 --video $(RUN)/episodes.mp4 >/dev/null
 	$(BIN)/python -m sb3_tbc.report $(RUN) --html $(RUN)/report.html
 
 test: install pytest
