@@ -14,6 +14,9 @@ fi
 has_library() { { ldconfig -p 2>/dev/null || /sbin/ldconfig -p 2>/dev/null; } | grep -q "$1"; }
 has_library libOSMesa || missing+=(libosmesa6)
 has_library libEGL.so || missing+=(libegl1)
+has_file() { compgen -G "$1" >/dev/null; } # EGL finds no way to draw without a driver, be it the one in software
+has_file '/usr/lib*/*/dri/swrast_dri.so' || has_file '/usr/lib*/dri/swrast_dri.so' || has_library libgallium- ||
+  missing+=(libgl1-mesa-dri)
 
 [ ${#missing[@]} -eq 0 ] && exit 0
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Array
-from .rendering import BODY, GOAL, INK, LIGHT_BODY, STATIC, SUBGOAL, TRIGGER, WATER, Canvas
+from .rendering import BODY, GOAL, INK, LIGHT_BODY, LIGHT_STATIC, STATIC, SUBGOAL, TRIGGER, WATER, Canvas
 
 Overlay = tuple[Array | None, float | None, str | None]
 Picture = NDArray[np.uint8]
@@ -106,8 +106,9 @@ def draw_platforms(state: dict[str, Array], statics: Sequence, goal: Array, over
     canvas.box((0.0, -0.55), (0.05, 0.05), TRIGGER, 0.9 if active else 0.35)
     if active:
         left = 1.0 - since / 188.5
+        canvas.box((0.0, -0.69), (0.15, 0.012), LIGHT_STATIC)
         canvas.box((-0.15 + 0.15 * left, -0.69), (0.15 * left, 0.012), TRIGGER)
-    x, row = canvas.to_pixel((-0.12, -0.62))
+    x, row = canvas.to_pixel((-0.145, -0.62))
     canvas.text(x, row, "trigger")
     subgoal = overlay[0]
     if subgoal is not None:
@@ -140,7 +141,8 @@ def draw_tennis(
     for name, half in zip(("rod0", "rod1"), halves, strict=False):
         x, y, angle = state[name][:3]
         canvas.circle((x + half[1] * math.sin(angle), y - half[1] * math.cos(angle)), 0.04, STATIC)
-    canvas.box((6.2, 1.2), (0.12, 0.08), INK)
+    canvas.box((6.13, 1.2), (0.1, 0.08), INK)
+    canvas.text(*canvas.to_pixel((5.92, 1.46)), "gun")
     ball = state["ball"]
     canvas.circle(ball[:2], 0.05, TRIGGER)
     canvas.arrow(ball[:2], 0.06 * ball[3:5], TRIGGER, 2.0, 0.6)

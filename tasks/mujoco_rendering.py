@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import os
+import sys
 import warnings
+import weakref
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
@@ -41,7 +44,7 @@ def _open_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, 
     """The first OpenGL context that works: the one named by MUJOCO_GL, or EGL, OSMesa, GLFW in this order."""
     named = os.environ.get("MUJOCO_GL", "").lower().strip()
     kinds = [named] if named in ("egl", "osmesa", "glfw", "cgl") else ["egl", "osmesa", "glfw"]
-    failures = []
+    failures, chosen = [], "PYOPENGL_PLATFORM" in os.environ
     for kind in kinds:
         try:
             with warnings.catch_warnings():
@@ -51,11 +54,28 @@ def _open_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, 
             return context, mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100.value)
         except Exception as error:  # Each backend fails with errors of its own library.
             failures.append(f"{kind}: {type(error).__name__}: {error}".splitlines()[0])
+            if not chosen:
+                _forget_pyopengl()
     raise GLUnavailable(
         "Drawing this task needs OpenGL, and no backend works here. Install one, e.g. `apt-get install libegl1 "
         "libgl1-mesa-dri` (EGL) or `apt-get install libosmesa6` (software, with MUJOCO_GL=osmesa set before Python "
         f"starts). Tried {'; '.join(failures)}"
     )
+
+
+def _forget_pyopengl() -> None:
+    """Have PyOpenGL imported afresh, because it stays with the backend that it met first, be it one that failed."""
+    os.environ.pop("PYOPENGL_PLATFORM", None)
+    backends = ("mujoco.egl", "mujoco.osmesa")
+    for name in list(sys.modules):
+        if name.partition(".")[0] == "OpenGL" or name.startswith(backends):
+            del sys.modules[name]
+
+
+def _release(gl: Any, context: mujoco.MjrContext) -> None:
+    gl.make_current()  # a context frees its objects by number, in whichever context is current
+    context.free()
+    gl.free()
 
 
 class Scene:
@@ -82,6 +102,10 @@ class Scene:
         self.model, (width, height) = model, size
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._gl, self._context = _open_context(model, width, height)
+        self.close = weakref.finalize(self, _release, self._gl, self._context)
+        """Give the OpenGL context back; happens by itself when nobody needs it, at the latest when Python ends."""
+        self.close.atexit = False
+        atexit.register(self.close)  # weakref's own hook may run only after EGL has ended
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
         self._viewport = mujoco.MjrRect(0, 0, width, height)
         self.scene = mujoco.MjvScene(model, maxgeom=400)
@@ -139,10 +163,3 @@ class Scene:
         pixels = np.empty((self._viewport.height, self._viewport.width, 3), dtype=np.uint8)
         mujoco.mjr_readPixels(pixels, None, self._viewport, self._context)
         return np.ascontiguousarray(pixels[::-1])
-
-    def close(self) -> None:
-        """Give the OpenGL context back."""
-        if self._gl is not None:
-            self._context.free()
-            self._gl.free()
-            self._gl = None

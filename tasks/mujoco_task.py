@@ -40,6 +40,7 @@ class MujocoTask(GoalTask):
         self._qvel: Array = self.data.qvel
         self._ctrl: Array = self.data.ctrl
         self._scene: Scene | None = None
+        self._title = type(self).__name__
         self._nominal = nominal_fields(self.model)
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
 
@@ -92,7 +93,7 @@ class MujocoTask(GoalTask):
         self._add_markers(self._scene)
         canvas = Canvas.over(self._scene.picture())
         subgoal, time_left, text = self._overlay
-        canvas.overlay(f"{type(self).__name__}  step {self._elapsed}", time_left, text, subgoal is not None)
+        canvas.overlay(f"{self._title}  step {self._elapsed}", time_left, text, subgoal is not None)
         return canvas.pixels
 
     def close(self) -> None:

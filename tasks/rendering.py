@@ -16,6 +16,7 @@ Color = tuple[int, int, int]
 PAPER: Color = (250, 249, 246)
 INK: Color = (43, 48, 58)
 STATIC: Color = (173, 179, 189)
+LIGHT_STATIC: Color = (222, 225, 230)
 BODY: Color = (38, 103, 173)
 LIGHT_BODY: Color = (122, 170, 217)
 GOAL: Color = (34, 150, 83)

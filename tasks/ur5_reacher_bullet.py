@@ -175,6 +175,7 @@ class UR5ReacherBullet(GoalTask):
         """The same picture as UR5Reacher's, of this engine's state."""
         if self._twin is None:
             self._twin = UR5Reacher(render_mode="rgb_array")
+            self._twin._title = type(self).__name__
         twin = self._twin
         twin.reset(options={"goal": self._goal, "state": self.task_state()})
         twin.data.qpos[:] = self.task_state()["qpos"]

@@ -10,6 +10,7 @@ from stable_baselines3.common.env_checker import check_env
 import sb3_tbc  # noqa: F401  (registers the tasks)
 
 pytest.importorskip("pybullet", reason="the extra `bullet` is not installed")
+from sb3_tbc.tasks.mujoco_rendering import GLUnavailable
 from sb3_tbc.tasks.ur5_reacher_bullet import solve3
 
 
@@ -89,6 +90,21 @@ def test_checker_and_bad_actions(bullet):
 
 def test_the_mujoco_script_solves_it(bullet):
     assert [episode_length(bullet, servo, seed=seed) is not None for seed in range(3)] == [True] * 3
+
+
+def test_the_picture_is_the_other_engines_under_its_own_name():
+    pictures = []
+    for name in ("UR5Reacher", "UR5ReacherBullet"):
+        env = gym.make(f"sb3_tbc/{name}-v0", render_mode="rgb_array")
+        env.reset(seed=2)
+        try:
+            pictures.append(env.render().astype(int))
+        except GLUnavailable as error:
+            pytest.skip(str(error))
+        env.close()
+    differs = np.abs(pictures[0] - pictures[1]).max(axis=-1) > 40
+    assert differs[:32].any()
+    assert not differs[32:].any()
 
 
 def test_solve3():

@@ -1,8 +1,11 @@
 """Pictures of the tasks: shape, overlay, the canvas itself, and what is said where drawing is impossible."""
 
 import importlib
+import os
+import subprocess
 import sys
 import types
+from ctypes.util import find_library
 
 import numpy as np
 import pytest
@@ -102,6 +105,50 @@ def test_render_without_mode_warns_and_returns_nothing():
     env.reset(seed=0)
     with pytest.warns(UserWarning, match="render_mode"):
         assert env.render() is None
+
+
+def test_closing_one_picture_leaves_the_other():
+    """OpenGL frees objects by number in whichever context is current."""
+    envs = [make("UR5Reacher", render_mode="rgb_array") for _ in range(2)]
+    try:
+        pictures = [(env.reset(seed=0), env.render())[1] for env in envs]
+    except mujoco_rendering.GLUnavailable as error:
+        pytest.skip(str(error))
+    envs[0].close()
+    np.testing.assert_array_equal(envs[1].render(), pictures[1])
+    envs[1].close()
+
+
+@pytest.mark.slow
+def test_osmesa_follows_a_failed_egl():
+    """The first backend that PyOpenGL meets leaves its name in the environment, and others refuse to follow it."""
+    code = """
+import os, sys
+import gymnasium as gym
+from sb3_tbc.tasks import mujoco_rendering, register_tasks
+
+def without_egl(name):
+    if name == "mujoco.egl":
+        os.environ["PYOPENGL_PLATFORM"] = "egl"
+        raise ImportError("no EGL")
+    return __import__(name, fromlist=["GLContext"])
+
+mujoco_rendering.import_module = without_egl
+register_tasks()
+env = gym.make("sb3_tbc/UR5Reacher-v0", render_mode="rgb_array")
+env.reset(seed=0)
+try:
+    env.render()
+except mujoco_rendering.GLUnavailable as error:
+    print(error)
+else:
+    print(type(env.unwrapped._scene._gl).__module__)
+"""
+    environ = {name: value for name, value in os.environ.items() if name not in ("MUJOCO_GL", "PYOPENGL_PLATFORM")}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environ)
+    if find_library("OSMesa") is None:
+        pytest.skip("OSMesa is not installed")
+    assert (done.stdout, done.stderr) == ("mujoco.osmesa\n", "")
 
 
 def test_missing_opengl_says_what_to_install(monkeypatch):
