@@ -49,18 +49,31 @@ class FrozenNDBC:
             self._read_dissipative(net.cell)
 
     def _read_conductance(self, cell: ConductanceCell) -> None:
-        """The logistic is ``(1 + tanh(x / 2)) / 2``, one call instead of four; the halves go into the matrices."""
+        """The logistic is ``(1 + tanh(x / 2)) / 2``, one call instead of four; the halves go into the matrices.
+
+        A sub-step works on ``[x / 2 | V]``, presynaptic arguments and all potentials: both come out of one product and
+        one quotient, ``[gain w - threshold g | w] / [g | g]``, for numerators w and denominators g of the potentials.
+        """
         arrays = type(cell.arrays())(*(tensor.double() for tensor in cell.arrays()))
         inertia = cell.pace(arrays, 1.0 / self._sub_steps)
+        gain, threshold = 0.5 * arrays.gain, 0.5 * cell.threshold.double()
+
+        def widened(matrix: th.Tensor) -> FloatArray:
+            weighted, total = matrix.chunk(2, dim=-1)
+            heard = total[..., : len(gain)]
+            arguments = weighted[..., : len(gain)] * gain - heard * threshold
+            return _numpy(th.cat([arguments, weighted, heard, total], dim=-1))
+
         sensory, current = th.split(arrays.from_inputs, [cell.n_inputs, cell.n_inter])
         half_sums = 0.5 * (sensory.sum(dim=0) + arrays.recurrent.sum(dim=0))
         excite = th.cat([th.diag(0.5 * arrays.sensory_gain), arrays.current_weight], dim=1)
         self._excite = _numpy(self.net.input_gain.unsqueeze(-1) * excite)
         self._excite_bias = _numpy(th.cat([-0.5 * cell.sensory_threshold, cell.current_bias]))
-        self._from_inputs = _numpy(th.cat([0.5 * sensory, current]))
-        self._rest = _numpy(arrays.rest + half_sums + functional.pad(inertia, (self.state_dim, 0)))
-        self._recurrent, self._inertia = _numpy(0.5 * arrays.recurrent), _numpy(inertia)
-        self._gain, self._threshold = _numpy(0.5 * arrays.gain), _numpy(0.5 * cell.threshold)
+        self._from_inputs = widened(th.cat([0.5 * sensory, current]))
+        self._rest = widened(arrays.rest + half_sums + functional.pad(inertia, (self.state_dim, 0)))
+        kept = functional.pad(th.diag(inertia), (0, self.state_dim))
+        self._recurrent = widened(th.cat([0.5 * arrays.recurrent, kept]))
+        self._gain, self._threshold = _numpy(gain), _numpy(threshold)
 
     def _read_dissipative(self, cell: DissipativeCell) -> None:
         arrays = cell.arrays()
@@ -86,22 +99,23 @@ class FrozenNDBC:
         return outputs.astype(np.float32), state.astype(np.float32)
 
     def _advance_conductance(self, inputs: FloatArray, state: FloatArray) -> FloatArray:
-        n, presynaptic = self.state_dim, len(self._gain)
-        recurrent, gain, threshold, inertia = self._recurrent, self._gain, self._threshold, self._inertia
-        inputs, state = inputs.astype(np.float64), state.astype(np.float64)  # once; mixed operands are slower
-        excited = inputs.dot(self._excite)
+        presynaptic, recurrent = len(self._gain), self._recurrent
+        excited = inputs.astype(np.float64).dot(self._excite)
         excited += self._excite_bias
-        drive = np.tanh(excited, out=excited).dot(self._from_inputs)
+        drive = np.tanh(excited, excited).dot(self._from_inputs)
         drive += self._rest
+        now, total = np.empty((len(state), len(recurrent))), np.empty_like(drive)
+        arguments, potentials = now[:, :presynaptic], now[:, presynaptic:]
+        numerators, denominators = total[:, : len(recurrent)], total[:, len(recurrent) :]
+        potentials[...] = state
+        np.multiply(potentials[:, :presynaptic], self._gain, arguments)
+        arguments -= self._threshold
         for _ in range(self._sub_steps):
-            released = state[:, :presynaptic] * gain
-            released -= threshold
-            total = np.tanh(released, out=released).dot(recurrent)
+            np.tanh(arguments, arguments)
+            now.dot(recurrent, total)
             total += drive
-            state *= inertia
-            state += total[:, :n]
-            state /= total[:, n:]
-        return state
+            np.divide(numerators, denominators, now)
+        return potentials
 
     def _advance_dissipative(self, inputs: FloatArray, state: FloatArray) -> FloatArray:
         drive = inputs.dot(self._excite)
