@@ -9,8 +9,7 @@ from pathlib import Path
 from sb3_tbc.callbacks import save_atomic, write_atomic
 from sb3_tbc.cli import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.export_policy import Circuit, ExportedPolicy, extract
-from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.export_policy import MLP, Circuit, ExportedPolicy, extract
 from sb3_tbc.zoo.algorithms import load_two_levels
 
 SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
@@ -63,7 +62,7 @@ WRITERS: dict[str, Callable[[ExportedPolicy, Path], None]] = {"onnx": write_onnx
 def describe(policy: ExportedPolicy) -> str:
     """One line about what was exported."""
     low = policy.low
-    kind = f"circuit of {low.n_neurons} neurons, K = {low.sub_steps}" if isinstance(low, Circuit) else "MLP"
+    kind = "MLP" if isinstance(low, MLP) else f"circuit of {low.n_neurons} neurons, K = {low.sub_steps}"
     return f"{policy.task}: {policy.n_observation} observations, {len(policy.action_low)} actions, low level {kind}"
 
 
@@ -71,11 +70,7 @@ def command(argv: Sequence[str]) -> int:
     """Export; see ``--help``."""
     args = build_parser().parse_args(argv)
     model = load_two_levels(args.model)
-    if model.schedule is not None or not model.remaining_time:
-        raise ConfigError(f"{args.model}: only agents that choose their time budgets and see the rest can be exported")
     path = args.output or args.model.with_suffix(SUFFIXES[args.format])
-    if not isinstance(model, TBCHRL):
-        raise ConfigError(f"{args.model} holds {type(model).__name__}, which has one level: only two-level agents")
     policy = extract(model, args.model.stem)
     WRITERS[args.format](policy, path)
     print(f"{describe(policy)}\nwritten: {path}")

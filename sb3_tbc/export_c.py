@@ -9,7 +9,7 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.export_policy import MLP, Circuit, Coordinate, ExportedPolicy, FloatArray
+from sb3_tbc.export_policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy, FloatArray
 
 
 def to_c(policy: ExportedPolicy) -> str:
@@ -17,16 +17,18 @@ def to_c(policy: ExportedPolicy) -> str:
 
     :param policy: what to export
     """
-    circuit = isinstance(policy.low, Circuit)
-    low = _circuit(policy.low) if isinstance(policy.low, Circuit) else _mlp("low", policy.low)
+    data, code = _low_level(policy.low)
     values = {
         "TASK": re.sub(r"[^A-Za-z0-9_.-]", "_", policy.task),
         "SIZES": _sizes(policy),
-        "LOW_DATA": low,
-        "LOW_CODE": _template("export_circuit.c") if circuit else _LOW_MLP,
+        "LOW_DATA": data,
+        "LOW_CODE": code,
         "HIGH_DATA": _mlp("high", policy.high) + _option_data(policy),
         "ACHIEVED": "\n".join(_coordinate(i, c) for i, c in enumerate(policy.achieved)) or "    (void)entries;",
         "REACHED": _reached(policy),
+        "EVENT": ""
+        if policy.event is None
+        else f"\n        || (state->elapsed > 0 && observation[{policy.event}] > 0.5f)",
         "HIGH_INPUTS": _high_inputs(policy),
         "FORGET": {"window": "over", "episode": "started", "none": "1"}[policy.memory],
         "ASKED": "(state->subgoal[i] - here[i])" if policy.relative_subgoals else "state->subgoal[i]",
@@ -43,6 +45,15 @@ def to_c(policy: ExportedPolicy) -> str:
 
 def _template(name: str) -> str:
     return (files("sb3_tbc") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _low_level(low: MLP | Circuit | Dissipative) -> tuple[str, str]:
+    """Data and code."""
+    if isinstance(low, Circuit):
+        return _circuit(low), _template("export_circuit.c")
+    if isinstance(low, Dissipative):
+        return _dissipative(low), _template("export_dissipative.c")
+    return _mlp("low", low), _LOW_MLP
 
 
 def _sizes(policy: ExportedPolicy) -> str:
@@ -111,6 +122,13 @@ def _circuit(c: Circuit) -> str:
     text += _sparse("current", c.current_weight, {"weight": c.current_weight * input_gain[:, None]}, exact)
     text += _sparse("sensory", sensory[:, n:], {"weighted": sensory[:, :n], "total": sensory[:, n:]})
     text += _sparse("recurrent", c.recurrent[:, n:], {"weighted": c.recurrent[:, :n], "total": c.recurrent[:, n:]})
+    return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
+
+
+def _dissipative(c: Dissipative) -> str:
+    text = f"#define TBC_SUB_STEPS {c.sub_steps}\n#define TBC_ETA {floats(np.array(c.eta))}\n"
+    text += _sparse("input", c.input_weight, {"weight": c.input_weight}) + array("input_bias", c.bias)
+    text += _sparse("recurrent", c.recurrent, {"weight": c.recurrent}) + array("shrink", c.shrink)
     return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
 
 

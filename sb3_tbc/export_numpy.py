@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_tbc.export_policy import Circuit, ExportedPolicy
+from sb3_tbc.export_policy import ExportedPolicy
 
 
 def to_numpy_module(policy: ExportedPolicy) -> str:
@@ -25,7 +25,7 @@ def to_numpy_module(policy: ExportedPolicy) -> str:
                 _sort(f"{name}.{part}", content, arrays, settings)
         else:
             _sort(name, value, arrays, settings)
-    settings["low.kind"] = "circuit" if isinstance(policy.low, Circuit) else "mlp"
+    settings["low.kind"] = type(policy.low).__name__
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
     packed = base64.b64encode(buffer.getvalue()).decode()

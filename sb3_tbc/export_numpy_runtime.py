@@ -20,7 +20,7 @@ for _name in ARRAYS:
     if _name.startswith(("high.", "low.")):
         ARRAYS[_name] = ARRAYS[_name].astype(np.float64)  # as the agent itself acts
 CLOSED_FORM = False
-"""Set to True to take the circuit's closed form instead of its sub-steps."""
+"""Set to True to take a conductance circuit's closed form instead of its sub-steps."""
 
 
 def initial_state() -> State:
@@ -29,7 +29,7 @@ def initial_state() -> State:
         "subgoal": np.zeros(len(ARRAYS["subgoal_low"])),
         "time_budget": 0.0,
         "elapsed": -1,  # no option yet
-        "membrane": np.zeros(np.shape(ARRAYS.get("low.capacitance", ())), dtype=np.float32),
+        "membrane": np.zeros(len(ARRAYS.get("low.readout", ())), dtype=np.float32),
     }
 
 
@@ -43,6 +43,8 @@ def step(observation: Array, achieved_goal: Array, desired_goal: Array, state: S
     started = state["elapsed"] < 0
     here = _achieved(entries)
     over = started or state["elapsed"] >= state["time_budget"]
+    if SETTINGS["event"] is not None and state["elapsed"] > 0:
+        over = over or observation[SETTINGS["event"]] > 0.5
     if SETTINGS["window_end"] == "reached" and not over and state["elapsed"] >= SETTINGS["dt_min"]:
         over = _reached(here - state["subgoal"])
     if (over and SETTINGS["memory"] == "window") or started or SETTINGS["memory"] == "none":
@@ -53,10 +55,10 @@ def step(observation: Array, achieved_goal: Array, desired_goal: Array, state: S
     remaining = np.clip((state["time_budget"] - state["elapsed"]) / SETTINGS["dt_max"], 0.0, 1.0)
     parts = [entries[list(SETTINGS["local"])], asked] + ([[remaining]] if SETTINGS["remaining_time"] else [])
     seen = np.concatenate(parts).astype(np.float32)
-    if SETTINGS["low.kind"] == "mlp":
+    if SETTINGS["low.kind"] == "MLP":
         mean = _mlp("low", seen)
     else:
-        advance = _relax if CLOSED_FORM else _integrate
+        advance = _dissipate if SETTINGS["low.kind"] == "Dissipative" else _relax if CLOSED_FORM else _integrate
         potentials = advance(seen.astype(np.float64), state["membrane"].astype(np.float64))
         mean = (potentials @ ARRAYS["low.readout"] + ARRAYS["low.readout_bias"]).astype(np.float32)
         state["membrane"] = potentials.astype(np.float32)
@@ -130,6 +132,16 @@ def _integrate(seen: Array, membrane: Array) -> Array:
         total = drive + _logistic(membrane[:p] * a["low.gain"] - a["low.threshold"]) @ a["low.recurrent"]
         membrane = (membrane * pace + total[:n]) / (total[n:] + pace)
     return membrane
+
+
+def _dissipate(seen: Array, state: Array) -> Array:
+    """Sub-steps of the dissipative dynamics."""
+    a = ARRAYS
+    drive = seen @ a["low.input_weight"] + a["low.bias"]
+    for _ in range(SETTINGS["low.sub_steps"]):
+        force = np.tanh(drive + state @ a["low.recurrent"])
+        state = (state + SETTINGS["low.eta"] * force) * a["low.shrink"]
+    return state
 
 
 def _relax(seen: Array, membrane: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from sb3_tbc.export_policy import MLP, Circuit, Coordinate, ExportedPolicy, FloatArray
+from sb3_tbc.export_policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy, FloatArray
 
 OPSET = 17
 STATE_NAMES = ("subgoal", "time_budget", "elapsed", "membrane")
@@ -71,6 +71,9 @@ def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
     zero = g.constant(0.0, np.float64)
     started = g("Less", "elapsed", zero)
     over = g("Or", started, g("GreaterOrEqual", "elapsed", "time_budget"))
+    if policy.event is not None:
+        happened = g("Greater", g.columns("observation", [policy.event]), g.constant(0.5))
+        over = g("Or", over, g("And", happened, g("Greater", "elapsed", zero)))
     if policy.window_end == "reached" and here is not None:
         late = g("GreaterOrEqual", "elapsed", g.constant(policy.dt_min, np.float64))
         over = g("Or", over, g("And", late, _reached(g, policy, here)))
@@ -117,7 +120,10 @@ def _low(g: _Graph, policy: ExportedPolicy, seen: str, over: str, started: str) 
     else:
         membrane = g("Where", over if policy.memory == "window" else started, zeros, "membrane")
     membrane = g.cast(membrane, TensorProto.DOUBLE)
-    potentials = _circuit(g, policy.low, seen, membrane)
+    if isinstance(policy.low, Dissipative):
+        potentials = _dissipative(g, policy.low, seen, membrane)
+    else:
+        potentials = _circuit(g, policy.low, seen, membrane)
     g.cast(potentials, TensorProto.FLOAT, name="next_membrane")
     readout, bias = (g.constant(x, np.float64) for x in (policy.low.readout, policy.low.readout_bias))
     return g.single(g("Add", g("MatMul", potentials, readout), bias))
@@ -142,6 +148,16 @@ def _circuit(g: _Graph, c: Circuit, seen: str, potentials: str) -> str:
         weighted = g("Add", g("Mul", potentials, inertia), g.slice(received, 0, n))
         potentials = g("Div", weighted, g.slice(received, n, 2 * n))
     return potentials
+
+
+def _dissipative(g: _Graph, c: Dissipative, seen: str, state: str) -> str:
+    wide = np.float64
+    drive = g("Add", g("MatMul", seen, g.constant(c.input_weight, wide)), g.constant(c.bias, wide))
+    recurrent, eta, shrink = (g.constant(x, wide) for x in (c.recurrent, c.eta, c.shrink))
+    for _ in range(c.sub_steps):
+        force = g("Tanh", g("Add", drive, g("MatMul", state, recurrent)))
+        state = g("Mul", g("Add", state, g("Mul", force, eta)), shrink)
+    return state
 
 
 def _logistic(g: _Graph, x: str) -> str:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.ndbc.cell import ConductanceCell
+from sb3_tbc.ndbc.dissipative import DissipativeCell
 from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.policies import MLPActor, NDBCActor
@@ -81,6 +81,25 @@ class Circuit:
 
 
 @dataclass(frozen=True)
+class Dissipative:
+    """A dissipative circuit, ``x <- shrink (x + eta tanh(W u + U x + b))``; U as the certificate leaves it."""
+
+    sub_steps: int
+    eta: float  # length of a sub-step
+    input_weight: FloatArray  # (I, N)
+    bias: FloatArray
+    recurrent: FloatArray  # (N, N)
+    shrink: FloatArray  # diagonal of (I + eta K)^-1
+    readout: FloatArray  # (N, actions): means only
+    readout_bias: FloatArray
+
+    @property
+    def n_neurons(self) -> int:
+        """Neurons with a state."""
+        return len(self.bias)
+
+
+@dataclass(frozen=True)
 class ExportedPolicy:
     """Both levels' deterministic actors, and how an option begins and ends."""
 
@@ -89,7 +108,7 @@ class ExportedPolicy:
     n_achieved: int
     n_desired: int
     high: MLP
-    low: MLP | Circuit
+    low: MLP | Circuit | Dissipative
     mean_bounds: tuple[float, float]  # high, low; infinite if there is none
     local: tuple[int, ...]  # entries of (observation, achieved goal)
     achieved: tuple[Coordinate, ...]  # empty if no option ends on reaching its subgoal
@@ -100,6 +119,7 @@ class ExportedPolicy:
     dt_min: float
     dt_max: float
     window_end: str
+    event: int | None  # entry of the observation whose flag ends an option
     memory: str
     achieved_in_observation: bool
     relative_subgoals: bool
@@ -111,7 +131,7 @@ class ExportedPolicy:
     @property
     def state_dim(self) -> int:
         """Membrane potentials; 0 for an MLP low level."""
-        return self.low.n_neurons if isinstance(self.low, Circuit) else 0
+        return 0 if isinstance(self.low, MLP) else self.low.n_neurons
 
     @property
     def subgoal_dim(self) -> int:
@@ -160,6 +180,7 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
         dt_min=float(rules.dt_min),
         dt_max=float(rules.dt_max),
         window_end=rules.window_end,
+        event=subgoals.event,
         memory=model.memory,
         achieved_in_observation=layout.achieved_in_observation,
         relative_subgoals=layout.relative_subgoals,
@@ -197,19 +218,25 @@ def _read_mlp(actor: MLPActor) -> MLP:
 
 
 @th.no_grad()
-def read_circuit(net: NDBCNet, n_actions: int) -> Circuit:
+def read_circuit(net: NDBCNet, n_actions: int) -> Circuit | Dissipative:
     """The numbers of a network whose first ``n_actions`` outputs are the means.
 
-    :raises ConfigError: for dissipative dynamics and for networks with half-step checks
+    :raises ConfigError: for networks with half-step checks
     """
-    cell = net.cell
-    if not isinstance(cell, ConductanceCell):
-        raise ConfigError("only circuits with dynamics='conductance' can be exported")
     if net.step_rule is not None and net.step_rule.half_step_check:
         raise ConfigError("a circuit with half_step_check cannot be exported: its work varies from step to step")
-    a, wiring = cell.arrays(), net.wiring
+    cell, wiring = net.cell, net.wiring
     readout = np.zeros((wiring.n_neurons, n_actions), np.float32)
     readout[net.read_from :] = _numpy(net.readout_weight)[:n_actions].T
+    if isinstance(cell, DissipativeCell):
+        arrays = cell.arrays()
+        eta = cell.pace(arrays, 1.0 / net.sub_steps)
+        return Dissipative(
+            net.sub_steps, float(eta[0]), _numpy(net.input_gain.unsqueeze(-1) * arrays.input_weight), _numpy(cell.bias),
+            _numpy(cell.enforced(arrays, eta)), _numpy(1.0 / (1.0 + eta * arrays.damping)),
+            readout, _numpy(net.readout_bias)[:n_actions],
+        )  # fmt: skip
+    a = cell.arrays()
     return Circuit(
         net.sub_steps, wiring.relaxation_order(), _numpy(net.input_gain), _numpy(a.sensory_gain),
         _numpy(cell.sensory_threshold), _numpy(a.current_weight), _numpy(cell.current_bias), _numpy(a.from_inputs),

@@ -12,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from test_events import Bell
 
 import sb3_tbc.export
 from sb3_tbc import TBCHRL, train
@@ -37,18 +38,21 @@ ANT = {"inter": 12, "command": 10, "motor": 8, "sensory_fanout": 5, "inter_fanou
        "recurrent_command_synapses": 2, "motor_fanin": 6}  # fmt: skip
 PENDULUM = {"inter": 6, "command": 6, "motor": 1, "sensory_fanout": 3, "inter_fanout": 4,
             "recurrent_command_synapses": 1, "motor_fanin": 4}  # fmt: skip
+DISSIPATIVE = {**PENDULUM, "dynamics": "dissipative", "max_rho": 0.97}
 CASES = {
     "reached": ("Pendulum", {"window_end": "reached", "memory": "window"}),
     "relative": ("UR5Reacher", {"window_end": "reached", "relative_subgoals": True, "memory": "episode", "dt_min": 3}),
     "mlp": ("Pendulum", {"window_end": "timed", "memory": "none", "low": {"policy_kwargs": {"ndbc": None}}}),
     "memoryless": ("Pendulum", {"memory": "none"}),
     "hac": ("Pendulum", {}),
+    "dissipative": ("Pendulum", {"memory": "window", "low": {"policy_kwargs": {"ndbc": DISSIPATIVE}}}),
+    "event": ("Bell", {"dt_max": 12.0, "memory": "window"}),
 }
 
 
 def make(case: str) -> tuple[TBCHRL, gym.Env]:
     task, kwargs = CASES[case]
-    env = gym.make(f"sb3_tbc/{task}-v0")
+    env = Bell() if task == "Bell" else gym.make(f"sb3_tbc/{task}-v0")
     small = {"policy_kwargs": {"net_arch": [12, 8]}}
     algorithm = HAC if case == "hac" else TBCHRL
     model = algorithm("MultiInputPolicy", env, seed=1, compile=False, **{"high": small, **kwargs})
@@ -91,7 +95,7 @@ def trained_look(model: TBCHRL, seed: int = 0) -> TBCHRL:
 
 
 @pytest.mark.parametrize("kind", ["numpy", "onnx", pytest.param("c", marks=needs_cc)])
-@pytest.mark.parametrize("case", ["reached", "relative", "mlp", "memoryless"])
+@pytest.mark.parametrize("case", ["reached", "relative", "mlp", "memoryless", "dissipative"])
 def test_large_weights_do_not_part_them(case: str, kind: str, tmp_path: Path) -> None:
     if kind == "onnx":
         pytest.importorskip("onnxruntime")
@@ -214,7 +218,7 @@ int main(void)
 
 
 @needs_cc
-@pytest.mark.parametrize("case", ["reached", "relative", "mlp"])
+@pytest.mark.parametrize("case", ["reached", "relative", "mlp", "dissipative", "event"])
 def test_the_c_file_is_clean_under_sanitizers(case: str, tmp_path: Path) -> None:
     (tmp_path / "policy.c").write_text(to_c(extract(make(case)[0], case)))
     (tmp_path / "main.c").write_text(MAIN)
@@ -280,6 +284,18 @@ def test_an_agent_with_windows_from_another_network_is_refused() -> None:
     model = TBCHRL("MultiInputPolicy", gym.make("sb3_tbc/Pendulum-v0"), seed=0, compile=False, duration="rule")
     with pytest.raises(ConfigError, match="duration='rule'"):
         extract(model)
+
+
+@pytest.mark.parametrize("case", ["hac", "dissipative"])
+def test_the_command_exports_every_kind_of_low_level(
+    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    make(case)[0].save(tmp_path / "agent.zip")
+    arguments = [str(tmp_path / "agent.zip"), "--format", "numpy", "--check", "30", "--env", "Pendulum"]
+    assert sb3_tbc.export.command(arguments) == 0
+    printed = capsys.readouterr().out
+    assert "checked: 30 steps" in printed
+    assert "closed form" not in printed
 
 
 def test_the_command_writes_and_checks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,8 +5,8 @@
  *     for each control step:
  *         tbc_step(&state, observation, achieved_goal, desired_goal, 0, action);
  *
- * The fifth argument chooses how the circuit is evaluated: 0 integrates its sub-steps as in training, 1 takes the closed
- * form. To use the functions from another file, define TBC_DECLARATIONS_ONLY there and include this one.
+ * The fifth argument chooses how a conductance circuit is evaluated: 0 integrates its sub-steps as in training, 1 takes the
+ * closed form. To use the functions from another file, define TBC_DECLARATIONS_ONLY there and include this one.
  * TBC_LOW_LEVEL_ONLY leaves out the high level. Both levels work in double precision, as predict does; define TBC_SINGLE
  * everywhere for processors that have single precision only, at the price of the fourth digit of an action.
  */
@@ -112,7 +112,7 @@ void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
     memcpy(entries, observation, TBC_OBSERVATION * sizeof(float));
     memcpy(entries + TBC_OBSERVATION, achieved_goal, TBC_ACHIEVED_GOAL * sizeof(float));
     subgoal_point(entries, here);
-    over = started || state->elapsed >= state->time_budget
+    over = started || state->elapsed >= state->time_budget@EVENT@
         || (state->elapsed >= TBC_DT_MIN && reached(here, state->subgoal));
     if (@FORGET@) {
         memset(state->membrane, 0, sizeof state->membrane);
