@@ -110,7 +110,11 @@ def new_settings(args: argparse.Namespace) -> StudySettings:
     wanted = args.config or next(reversed(runs))
     base = runs[wanted] if wanted in runs else next(iter(runs.values()))
     runs = {name: replace(run, n_timesteps=base.n_timesteps) for name, run in runs.items()}  # one budget for all
-    eval_freq = args.eval_freq or max(base.n_timesteps // 40, 100)
+    eval_freq = args.eval_freq or min(max(base.n_timesteps // 40, 100), base.n_timesteps)
+    if eval_freq > base.n_timesteps:
+        raise ConfigError(
+            f"--eval-freq must be at most the {base.n_timesteps} steps of a run, or none is evaluated; got {eval_freq}"
+        )
     resolved = {"n_timesteps": base.n_timesteps, "n_envs": base.n_envs, "eval_freq": eval_freq}
     space = restrict(load_space(args.algo, task, args.search_space), base, args.search or [], fixed)
     return StudySettings(
@@ -197,6 +201,8 @@ def command(argv: Sequence[str]) -> int:
     args = build_parser().parse_args(argv)
     if find_spec("optuna") is None:
         raise ConfigError("searching needs Optuna: pip install 'sb3_tbc[tune]'")
+    if not args.minutes > 0:
+        raise ConfigError(f"--minutes must be above 0, got {args.minutes:g}")
     th.set_num_threads(1)
     from sb3_tbc.zoo.pruning import make_pruner
 
@@ -248,6 +254,8 @@ def summarise(study: Study, settings: StudySettings, folder: Path) -> None:
             print(f"{trial.user_attrs[ORIGIN]:<14} {settings.objective} {trial.value:.4g}   (trial {trial.number})")
     best = study.best_trial
     path = reports.write_trial(settings, best, study.study_name, folder / "best.yml")
+    if len(done) > 1 and len({trial.value for trial in done}) == 1:
+        print(f"note           all {len(done)} trials have the same value; a larger --n-timesteps may tell them apart")
     print(f"best           {settings.objective} {best.value:.4g}   (trial {best.number})")
     print(f"settings       {path}")
     print(f"its curve      {shlex.join(['python', '-m', 'sb3_tbc.train', *train_arguments(settings, path)])}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
+import re
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -181,12 +182,11 @@ def is_url(storage: str) -> bool:
 
 
 def shown(storage: str) -> str:
-    """A storage's name without its password."""
-    if not is_url(storage):
-        return storage
-    scheme, _, rest = storage.partition("://")
+    """A storage's name without its password, wherever it stands, in a mistyped URL too."""
+    begin, slashes, rest = storage.partition("//")
     account, at, host = rest.rpartition("@")
-    return f"{scheme}://{account.partition(':')[0]}{':***' if ':' in account else ''}{at}{host}"
+    host = re.sub(r"(password=)[^&]*", r"\1***", host)
+    return f"{begin}{slashes}{account.partition(':')[0]}{':***' if ':' in account else ''}{at}{host}"
 
 
 def open_storage(storage: str, grace: int = 120) -> BaseStorage:
@@ -220,7 +220,7 @@ def _open(storage: str, grace: int) -> BaseStorage:
     if path.suffix not in JOURNAL_SUFFIXES:
         raise ConfigError(
             f"storage must be a journal file ending in {' or '.join(JOURNAL_SUFFIXES)}, or a URL like "
-            f"sqlite:///study.db or postgresql+psycopg://user@host/name; got {storage!r}"
+            f"sqlite:///study.db or postgresql+psycopg://user@host/name; got {shown(storage)!r}"
         )
     path.parent.mkdir(parents=True, exist_ok=True)
     return JournalWithHeartbeat(path, interval, grace, retry)
@@ -293,9 +293,9 @@ def check_same(settings: StudySettings, name: str, asked: Mapping[str, Any]) -> 
     begun = {**settings.asked, "algo": settings.algo, "env": settings.task}
     for option, value in asked.items():
         if value is not None and begun.get(option) != value:
-            kind = "of another algorithm" if option == "algo" else "begun with other options"
+            kind = "is of another algorithm" if option == "algo" else "was begun with other options"
             flag = f"--{option.replace('_', '-')}"
-            raise ConfigError(f"study {name!r} is {kind}: {flag} is {begun.get(option)} there, not {value}; {cure}")
+            raise ConfigError(f"study {name!r} {kind}: {flag} is {begun.get(option)} there, not {value}; {cure}")
 
 
 def queue_first_trials(study: Study, settings: StudySettings) -> None:

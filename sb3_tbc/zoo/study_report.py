@@ -109,8 +109,9 @@ def complete_trials(study: Study) -> list[FrozenTrial]:
 
 
 def importances(study: Study) -> dict[str, float]:
-    """Share of each parameter in the difference between good and bad trials (PED-ANOVA); empty below 4 trials."""
-    if len(complete_trials(study)) < 4:
+    """Share of each parameter in the difference between good and bad trials (PED-ANOVA); empty if few or equal."""
+    values = {trial.value for trial in complete_trials(study)}
+    if len(complete_trials(study)) < 4 or len(values) == 1:
         return {}
     try:
         with warnings.catch_warnings():
@@ -118,7 +119,7 @@ def importances(study: Study) -> dict[str, float]:
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
             found = optuna.importance.get_param_importances(study, evaluator=evaluator)
     except (ValueError, RuntimeError):
-        return {}  # e.g. every trial has the same value
+        return {}  # e.g. no parameter that all trials have
     return {name: share for name, share in found.items() if math.isfinite(share)}
 
 

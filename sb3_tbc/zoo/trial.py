@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import socket
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,7 +36,7 @@ NOT_A_DISTRIBUTION = "to satisfy the constraint"
 
 
 class Surplus(Exception):
-    """Two workers began the last trial at the same time; the later one lets go."""
+    """Two workers began the last trial, or queued the same baseline, at the same time; the later one lets go."""
 
 
 class Stopped(Exception):
@@ -89,12 +90,14 @@ class TrialRunner:
     :param folder: each trial's runs go to ``<folder>/trial_<number>/seed_<seed>/``
     :param n_trials: size of the search; a trial beyond it is dropped
     :param options: how runs are carried out
+    :param tell: called with a line about each finished seed but the last
     """
 
     settings: StudySettings
     folder: Path
     n_trials: int
     options: RunOptions
+    tell: Callable[[str], None]
 
     def __call__(self, trial: Trial) -> float:
         """Train all seeds.
@@ -118,7 +121,10 @@ class TrialRunner:
 
     def _claim(self, trial: Trial) -> None:
         trials = trial.study.get_trials(deepcopy=False, states=(*COUNTED, TrialState.RUNNING))
-        if sum(other.number < trial.number for other in trials) >= self.n_trials:
+        before = [other for other in trials if other.number < trial.number]
+        origin = trial.user_attrs.get(ORIGIN)
+        same = [other for other in trials if origin and other.user_attrs.get(ORIGIN) == origin]
+        if len(before) >= self.n_trials or any(other in before or other.state in COUNTED for other in same):
             raise Surplus
 
     def _run(self, trial: Trial, run: RunConfig) -> float:
@@ -128,9 +134,13 @@ class TrialRunner:
             if str(seed) in scores:
                 self._report_again(trial, index, seed)
                 continue
+            begun = time.monotonic()
             scores[str(seed)] = self._seed(trial, run, index, seed, earlier)
             trial.set_user_attr(SEED_VALUES, scores)
             if index + 1 < self.settings.n_seeds:
+                self.tell(
+                    f"trial {trial.number}, seed {seed}: {scores[str(seed)]:.3g}, {time.monotonic() - begun:.0f} s"
+                )
                 self._ask(trial, f"after seed {seed}")
         return float(ACROSS[self.settings.across_seeds]([scores[str(seed)] for seed in self.settings.seeds]))
 

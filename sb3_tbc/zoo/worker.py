@@ -11,6 +11,7 @@ import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from types import FrameType
@@ -83,7 +84,7 @@ def load(job: Job, index: int) -> tuple[Study, TrialRunner]:
     study.pruner = make_pruner(job.pruner, settings.n_evaluations, settings.n_seeds)
     resolve_env(settings.env)  # imports the module that registers it
     options = RunOptions(device=job.device, verbose=0, checkpoint_seconds=math.inf)
-    return study, TrialRunner(settings, job.folder, job.n_trials, options)
+    return study, TrialRunner(settings, job.folder, job.n_trials, options, partial(_say, index))
 
 
 def work(job: Job, index: int) -> None:
@@ -182,7 +183,7 @@ def run_workers(job: Job, n: int) -> int:
         _stop(workers)
         raise
     codes = [worker.exitcode for worker in workers]
-    return 0 if 0 in codes else USER_MISTAKE if USER_MISTAKE in codes else 1
+    return next((code for code in (0, USER_MISTAKE, INTERRUPTED) if code in codes), 1)
 
 
 def _watch(workers: Sequence[BaseProcess]) -> None:
@@ -192,7 +193,9 @@ def _watch(workers: Sequence[BaseProcess]) -> None:
         for worker in [w for w in waiting if not w.is_alive()]:
             waiting.remove(worker)
             code = worker.exitcode or 0
-            if code != 0:
+            if code == INTERRUPTED:
+                print(f"{worker.name} was stopped; its trial is back in the queue", file=sys.stderr)
+            elif code != 0:
                 how = f"signal {-code}" if code < 0 else f"exit status {code}"
                 print(f"{worker.name} ended with {how}; its trial will be run again by another", file=sys.stderr)
         time.sleep(0.2)
@@ -217,7 +220,8 @@ def _main(job: Job, index: int) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     th.set_num_threads(1)
     signal.signal(signal.SIGTERM, _interrupt_once)
-    signal.signal(signal.SIGINT, _interrupt_once)
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # in a script's background Ctrl-C is not meant for us
+        signal.signal(signal.SIGINT, _interrupt_once)
     try:
         work(job, index)
     except KeyboardInterrupt:
