@@ -23,14 +23,7 @@ from sb3_tbc.ndbc.wiring import NDBCWiring
 
 N_INPUTS, N_OUTPUTS = 10, 4
 ANT_FOUR_ROOMS = (12, 10, 8, 5, 8, 2, 6)  # table A1: the largest circuit, 30 neurons
-TABLE_A1 = {
-    "AntFourRooms": (12, 10, 8, 5, 8, 2, 6),
-    "UR5Reacher": (6, 4, 3, 4, 5, 2, 5),
-    "Drawbridge": (6, 6, 1, 3, 4, 3, 4),
-    "Tennis2D": (8, 6, 3, 4, 6, 4, 6),
-    "Pendulum": (6, 6, 1, 3, 4, 1, 4),
-    "Platforms": (6, 6, 1, 4, 5, 3, 5),
-}
+PAPER_TASKS = ("AntFourRooms", "UR5Reacher", "Drawbridge", "Tennis2D", "Pendulum", "Platforms")
 WIRING_NUMBERS = (
     "inter",
     "command",
@@ -262,7 +255,7 @@ def exported_steps() -> dict[int, float]:
 
 def acting(rounds: int) -> tuple[str, dict[str, float]]:
     """Single deterministic steps of AntFourRooms' agent: the circuit, the low level around it, and ``predict``."""
-    model, env = _small_agent("AntFourRooms", TABLE_A1["AntFourRooms"])
+    model, env = _small_agent("AntFourRooms", ANT_FOUR_ROOMS)
     circuit, rng = FrozenNDBC(model.low.policy.average_actor.net), np.random.default_rng(0)
     observation, _ = env.reset(seed=0)
     _, state = model.predict(observation, None, deterministic=True)
@@ -280,30 +273,66 @@ def acting(rounds: int) -> tuple[str, dict[str, float]]:
     return text, figures
 
 
-def parameters() -> tuple[list[str], dict[str, Any]]:
-    """Table A1's circuits as SAC actors of the low level, beside the MLP of the task's configuration."""
+class ShippedCircuit(NamedTuple):
+    """The low level's circuit of a task, as a configuration ships it."""
+
+    task: str
+    config: str  # "paper" (table A1) or "tuned"
+    wiring: NDBCWiring
+    sub_steps: int
+    n_actions: int
+    hidden: list[int]  # widths of the MLP it replaces, the low level of HiTS
+
+    @property
+    def title(self) -> str:
+        """Task, and what is not table A1's."""
+        return self.task if self.config == "paper" else f"{self.task}, {self.config}, K = {self.sub_steps}"
+
+
+def shipped_circuits() -> list[ShippedCircuit]:
+    """Every task's circuit by table A1, followed by the tuned one where that is another."""
+    found: list[ShippedCircuit] = []
+    for task in PAPER_TASKS:
+        paper, tuned = (_shipped_circuit(task, config) for config in ("paper", "tuned"))
+        found.append(paper)
+        if (tuned.wiring, tuned.sub_steps) != (paper.wiring, paper.sub_steps):
+            found.append(tuned)
+    return found
+
+
+def _shipped_circuit(task: str, config: str) -> ShippedCircuit:
     import gymnasium as gym
 
     import sb3_tbc.tasks
     from sb3_tbc.zoo.config import load_config
 
     sb3_tbc.tasks.register_tasks()
+    settings = load_config("tbc-hrl", task, config)
+    env = gym.make(f"sb3_tbc/{task}-v0", **settings.env_kwargs)
+    subgoals = env.unwrapped.subgoals  # type: ignore[attr-defined]
+    numbers = settings.model["low"]["policy_kwargs"]["ndbc"]
+    wiring = NDBCWiring(subgoals.local_dim + subgoals.dim + 1, **{name: numbers[name] for name in WIRING_NUMBERS})
+    hidden = load_config("hits", task, config).model["low"]["policy_kwargs"]["net_arch"]
+    n_actions = env.action_space.shape[0]  # type: ignore[index]
+    env.close()
+    return ShippedCircuit(task, config, wiring, numbers.get("sub_steps", 3), n_actions, hidden)
+
+
+def parameters() -> tuple[list[str], dict[str, Any]]:
+    """The shipped circuits as SAC actors of the low level, beside the MLP of the task's configuration."""
     lines = [
         "| task | neurons | synapses | NDBC actor | MLP it replaces | MLP actor | share |",
         "|---|---|---|---|---|---|---|",
     ]
     rows = []
-    for task, numbers in TABLE_A1.items():
-        env = gym.make(f"sb3_tbc/{task}-v0")
-        subgoals = env.unwrapped.subgoals  # type: ignore[attr-defined]
-        n_inputs, n_actions = subgoals.local_dim + subgoals.dim + 1, env.action_space.shape[0]  # type: ignore[index]
-        hidden = load_config("hits", task).model["low"]["policy_kwargs"]["net_arch"]
-        net = NDBCNet(n_inputs, 2 * n_actions, NDBCWiring(n_inputs, *numbers), seed=0)
-        count = count_parameters(net, hidden)
-        rows.append({"task": task, "hidden": hidden, **count._asdict(), "share": count.ratio})
-        widths = "x".join(str(h) for h in hidden)
+    for circuit in shipped_circuits():
+        wiring = circuit.wiring
+        count = count_parameters(NDBCNet(wiring.n_inputs, 2 * circuit.n_actions, wiring, seed=0), circuit.hidden)
+        row = {"task": circuit.task, "config": circuit.config, "hidden": circuit.hidden}
+        rows.append({**row, **count._asdict(), "share": count.ratio})
+        widths = "x".join(str(h) for h in circuit.hidden)
         numbers_of = (count.neurons, count.synapses, count.ndbc, widths, count.mlp)
-        lines.append(f"| {task} | {' | '.join(str(n) for n in numbers_of)} | {count.ratio:.1%} |")
+        lines.append(f"| {circuit.title} | {' | '.join(str(n) for n in numbers_of)} | {count.ratio:.1%} |")
     return lines, {"parameters": rows}
 
 

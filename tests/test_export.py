@@ -286,6 +286,16 @@ def test_an_agent_with_windows_from_another_network_is_refused() -> None:
         extract(model)
 
 
+@needs_cc
+def test_the_time_of_a_step_in_c_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    make("memoryless")[0].save(tmp_path / "agent.zip")
+    arguments = [str(tmp_path / "agent.zip"), "--format", "c", "--check", "30", "--env", "Pendulum"]
+    assert sb3_tbc.export.command(arguments) == 0
+    printed = capsys.readouterr().out
+    microseconds = float(printed.split("one low-level step on this machine:")[1].split()[0])
+    assert 0.0 < microseconds < 20.0  # the aim is 2; a busy machine gets leeway
+
+
 @pytest.mark.parametrize("case", ["hac", "dissipative"])
 def test_the_command_exports_every_kind_of_low_level(
     case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
