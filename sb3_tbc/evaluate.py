@@ -14,7 +14,7 @@ from sb3_tbc.cli import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.evaluation import evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, load_model, read_zip
-from sb3_tbc.zoo.environments import NAMESPACE, resolve_env
+from sb3_tbc.zoo.environments import NAMESPACE, make_env, resolve_env
 from sb3_tbc.zoo.ledger import summarise, to_json
 from sb3_tbc.zoo.runner import evaluation_envs
 
@@ -85,8 +85,9 @@ def command(argv: Sequence[str]) -> int:
     if args.video is not None:
         from sb3_tbc.video import record_video
 
-        model = load_model(args.model, device=args.device)
-        record_video(model, info["env_id"], args.video, args.video_episodes, args.seed, info["env_kwargs"])
+        env = make_env(info["env_id"], **info["env_kwargs"])
+        record_video(load_model(args.model, device=args.device), env, args.video, args.video_episodes, args.seed)
+        env.close()
         print(f"video: {args.video}", file=sys.stderr)
     return 0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -52,27 +52,25 @@ def episode_frames(model: Agent, env: gym.Env[Any, Any], seed: int | None = None
 
 
 def _frame(env: gym.Env[Any, Any]) -> Frame:
-    picture = np.asarray(env.render())
+    try:
+        picture: Any = env.render()
+    except Exception as error:  # An environment's own code may fail in any way.
+        cure = "" if "MUJOCO_GL" in str(error) else "; without a display, set MUJOCO_GL=egl or MUJOCO_GL=osmesa before"
+        raise ConfigError(f"the environment cannot be drawn: {error}{cure}") from error
+    if not isinstance(picture, np.ndarray):
+        raise ConfigError(f"the environment cannot be drawn: render() gave {picture!r}, not an array; see render_mode")
     height, width = picture.shape[:2]
     return picture[: height - height % 2, : width - width % 2]  # the codec wants even sizes
 
 
-def record_video(
-    model: Agent,
-    env_id: str,
-    path: Path,
-    n_episodes: int = 3,
-    seed: int = 0,
-    env_kwargs: Mapping[str, Any] | None = None,
-) -> None:
+def record_video(model: Agent, env: gym.Env[Any, Any], path: Path, n_episodes: int = 3, seed: int = 0) -> None:
     """Record deterministic episodes to an mp4 file, which appears only when it is complete.
 
     :param model: a trained agent
-    :param env_id: a registered task that can render
+    :param env: a task with ``render_mode="rgb_array"``
     :param path: the file, ending in ``.mp4``
     :param n_episodes: how many
     :param seed: episode ``i`` starts from ``seed + i``
-    :param env_kwargs: for ``gymnasium.make``
     :raises ConfigError: if the file's name, the installation or the task do not allow it
     """
     if path.suffix != ".mp4":
@@ -81,7 +79,6 @@ def record_video(
         import imageio.v2 as imageio
     except ImportError as error:
         raise ConfigError("videos need imageio: pip install 'sb3_tbc[video]'") from error
-    env = gym.make(env_id, render_mode="rgb_array", **(env_kwargs or {}))
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
     fps = env.metadata.get("render_fps", 30)
@@ -94,4 +91,3 @@ def record_video(
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-        env.close()

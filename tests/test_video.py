@@ -46,8 +46,19 @@ def test_frames_follow_the_live_option(model: TBCHRL, monkeypatch: pytest.Monkey
 def test_the_file_is_written_whole(model: TBCHRL, tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     path = tmp_path / "videos" / "a.mp4"
-    record_video(model, ENV_ID, path, n_episodes=1)
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    record_video(model, env, path, n_episodes=1)
     assert path.stat().st_size > 1000
     assert [p.name for p in path.parent.iterdir()] == ["a.mp4"]
     with pytest.raises(ConfigError, match=r"must end in \.mp4"):
-        record_video(model, ENV_ID, tmp_path / "a.gif")
+        record_video(model, env, tmp_path / "a.gif")
+
+
+def test_what_cannot_be_drawn_costs_one_line(model: TBCHRL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    for picture, message in ((lambda: None, "render_mode"), (lambda: 1 / 0, "division by zero; .* MUJOCO_GL=egl")):
+        monkeypatch.setattr(env.unwrapped, "render", picture)
+        with pytest.raises(ConfigError, match=f"cannot be drawn: .*{message}"):
+            record_video(model, env, tmp_path / "a.mp4")
+    assert not list(tmp_path.iterdir())

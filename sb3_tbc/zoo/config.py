@@ -141,7 +141,8 @@ def load_config(
     :param path: another configuration file
     :raises ConfigError: for unknown names and wrong values
     """
-    sections = read_file(path or config_file(algo))
+    path = path or config_file(algo)
+    sections = read_file(path)
     default, section = dict(sections.get("default", {})), dict(sections.get(task, {}))
     tuned = merge(default.pop("tuned", {}), section.pop("tuned", {}))
     config = config or ("tuned" if tuned else "paper")
@@ -158,6 +159,11 @@ def load_config(
     if subgoals:  # belongs to the environment, and stays with it in a saved agent
         merged["env_kwargs"] = {**(merged.get("env_kwargs") or {}), "subgoals": subgoals}
     run = {key: merged.pop(key) for key in RUN if merged.get(key) is not None}
-    if run.get("n_timesteps", 0) <= 0 or run.get("n_envs", 1) <= 0:
+    if "n_timesteps" not in run:
+        raise ConfigError(
+            f"neither section {task} nor section default of {path} says n_timesteps; a file of your own takes the "
+            "place of the shipped one, so start from a copy of that"
+        )
+    if run["n_timesteps"] <= 0 or run.get("n_envs", 1) <= 0:
         raise ConfigError(f"n_timesteps and n_envs must be positive, got {run}")
     return RunConfig(algo=algo, task=task, config=config, model=merged, **run)

@@ -89,7 +89,7 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[st
         _import(module, env_id)
     try:
         kwargs = dict(env_kwargs or {})
-        env = make_vec_env(partial(_make, env_id), n_envs, seed=seed, env_kwargs=kwargs, vec_env_cls=GoalVecEnv)
+        env = make_vec_env(partial(make_env, env_id), n_envs, seed=seed, env_kwargs=kwargs, vec_env_cls=GoalVecEnv)
     except ConfigError:
         raise
     except Exception as error:  # An environment's own code may fail in any way.
@@ -112,8 +112,14 @@ def _cause(error: Exception) -> str:
     return f"{type(error).__name__} in {Path(place.filename).name}, line {place.lineno}: {message}"
 
 
-def _make(env_id: str, subgoals: Mapping[str, Any] | None = None, **env_kwargs: Any) -> gym.Env[Any, Any]:
-    """Make one environment; a goal environment that does not say what to ask for gets a derived subgoal space."""
+def make_env(env_id: str, subgoals: Mapping[str, Any] | None = None, **env_kwargs: Any) -> gym.Env[Any, Any]:
+    """Make one environment, able to draw itself where it can; a foreign goal environment gets a derived subgoal space.
+
+    :param env_id: as registered
+    :param subgoals: for :class:`~sb3_tbc.tasks.generic.DescribedGoalEnv`
+    :param env_kwargs: for ``gymnasium.make``
+    :raises ConfigError: if it is told about subgoals although it brings its own
+    """
     try:
         env = gym.make(env_id, **{"render_mode": "rgb_array", **env_kwargs})
     except TypeError:
