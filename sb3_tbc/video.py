@@ -55,7 +55,7 @@ def _frame(env: gym.Env[Any, Any]) -> Frame:
     try:
         picture: Any = env.render()
     except Exception as error:  # An environment's own code may fail in any way.
-        cure = "" if "MUJOCO_GL" in str(error) else "; without a display, set MUJOCO_GL=egl or MUJOCO_GL=osmesa before"
+        cure = "" if "MUJOCO_GL" in str(error) else "; without a display, set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
         raise ConfigError(f"the environment cannot be drawn: {error}{cure}") from error
     if not isinstance(picture, np.ndarray):
         raise ConfigError(f"the environment cannot be drawn: render() gave {picture!r}, not an array; see render_mode")
