@@ -75,9 +75,9 @@ def floats(values: FloatArray) -> str:
     return ", ".join((x if any(c in x for c in ".en") else x + ".0") + "f" for x in literals)
 
 
-def array(name: str, values: FloatArray) -> str:
-    """A constant array of floats."""
-    return f"static const float {name}[{max(1, np.size(values))}] = {{{floats(values) or '0.0f'}}};\n"
+def array(name: str, values: FloatArray, kind: str = "tbc_real") -> str:
+    """A constant array of single-precision numbers, in the precision of what is computed with them: that is faster."""
+    return f"static const {kind} {name}[{max(1, np.size(values))}] = {{{floats(values) or '0.0f'}}};\n"
 
 
 def exact(name: str, values: FloatArray) -> str:
@@ -176,7 +176,7 @@ def _mlp(name: str, mlp: MLP) -> str:
 
 _RULES = {"linear": "sum", "relu": "(sum > 0 ? sum : 0)", "tanh": "TBC_TANH(sum)"}
 _DENSE = """
-static void @NAME@_dense_@KIND@(int inputs, int outputs, const float *w, const float *b, const tbc_real *x,
+static void @NAME@_dense_@KIND@(int inputs, int outputs, const tbc_real *w, const tbc_real *b, const tbc_real *x,
                                 tbc_real *y)
 {
     int i, j;
@@ -198,7 +198,7 @@ def _doubles(name: str, values: FloatArray) -> str:
 def _option_data(policy: ExportedPolicy) -> str:
     text = _indices("local_entry", np.array(policy.local))
     text += _doubles("subgoal_low", policy.subgoal_low) + _doubles("subgoal_high", policy.subgoal_high)
-    text += array("action_low", policy.action_low) + array("action_high", policy.action_high)
+    text += array("action_low", policy.action_low, "float") + array("action_high", policy.action_high, "float")
     bounds = [b if np.isfinite(b) else np.finfo(np.float32).max for b in policy.mean_bounds]
     text += (
         f"#define TBC_HIGH_BOUND {floats(np.array(bounds[0]))}\n#define TBC_LOW_BOUND {floats(np.array(bounds[1]))}\n"

@@ -26,18 +26,21 @@ static void circuit_drive(const float *seen, tbc_real *weighted, tbc_real *total
         for (k = current_begin[i]; k < current_begin[i + 1]; ++k) {
             current += current_weight[k] * seen[current_pre[k]];
         }
-        weighted[i] += input_conductance[i] * TBC_TANH(current);
+        weighted[i] += input_conductance[i] * (1 - 2 * logistic(-2 * current)); /* tanh */
     }
 }
 
 /* Adds what the neurons release to numerator and denominator of neuron i. */
-static void circuit_receive(int i, const tbc_real *released, tbc_real *weighted, tbc_real *total)
+static inline void circuit_receive(int i, const tbc_real *released, tbc_real *weighted, tbc_real *total)
 {
+    tbc_real w = *weighted, g = *total; /* in registers: through the pointers every sum would go to memory */
     int k;
     for (k = recurrent_begin[i]; k < recurrent_begin[i + 1]; ++k) {
-        *weighted += recurrent_weighted[k] * released[recurrent_pre[k]];
-        *total += recurrent_total[k] * released[recurrent_pre[k]];
+        w += recurrent_weighted[k] * released[recurrent_pre[k]];
+        g += recurrent_total[k] * released[recurrent_pre[k]];
     }
+    *weighted = w;
+    *total = g;
 }
 
 static void circuit_integrate(tbc_real *v, const tbc_real *weighted, const tbc_real *total)
@@ -49,7 +52,7 @@ static void circuit_integrate(tbc_real *v, const tbc_real *weighted, const tbc_r
             released[i] = logistic(gain[i] * v[i] - threshold[i]);
         }
         for (i = 0; i < TBC_STATE; ++i) {
-            const tbc_real inertia = (tbc_real)capacitance[i] * TBC_SUB_STEPS;
+            const tbc_real inertia = capacitance[i] * TBC_SUB_STEPS;
             tbc_real w = weighted[i], g = total[i];
             circuit_receive(i, released, &w, &g);
             v[i] = (v[i] * inertia + w) / (g + inertia);
