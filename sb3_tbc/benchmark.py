@@ -9,6 +9,7 @@ from typing import Any
 
 from sb3_tbc.callbacks import write_atomic
 from sb3_tbc.cli import Parser, positive_int, run_command
+from sb3_tbc.zoo.config import CONFIGS
 from sb3_tbc.zoo.ledger import to_json
 
 
@@ -29,6 +30,10 @@ def build_parser() -> Parser:
     train.add_argument("tasks", nargs="*", default=["Pendulum", "Drawbridge"], metavar="TASK")
     train.add_argument("--what", nargs="+", default=["speed", "split", "update"], metavar="WHAT",
                        help="of speed, split, update, growth, n-envs, memory, budget")  # fmt: skip
+    train.add_argument(
+        "--config", choices=CONFIGS, help="which values of the tasks' settings; tuned where there are any"
+    )
+    train.add_argument("--n-envs", type=positive_int, default=1, help="environments side by side, of split")
     train.add_argument("--steps", type=positive_int, default=2000, help="environment steps of a stretch of learning")
     train.add_argument("--rounds", type=positive_int, default=5, help="stretches of each contender, in turns")
     train.add_argument("--json", metavar="OUT", help="write the figures here too")

@@ -72,25 +72,28 @@ def ours(task: str, n_envs: int = 1, config: str | None = None, **settings: Any)
     return agent
 
 
-def contenders(task: str) -> list[Contender]:
+def contenders(task: str, config: str | None = None) -> list[Contender]:
     """TBC-HRL, SB3's SAC and, where it is installed, SBX's, on the same task.
 
     The flat agents get the low level's network sizes and batch, one update where TBC-HRL does one on each level, and
     the task's observation as one flat vector, which is what they are fastest on.
     """
-    model = ours(task)
+    model = ours(task, config=config)
     found = [Contender("TBC-HRL", lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)]
     from stable_baselines3 import SAC
 
     kinds: dict[str, Any] = {"SB3 SAC": SAC}
     if find_spec("sbx") is not None:
         kinds["SBX SAC"] = import_module("sbx").SAC
-    return found + [_flat(name, kind, task, model) for name, kind in kinds.items()]
-
-
-def _flat(name: str, kind: Any, task: str, model: TBCHRL) -> Contender:
     task, env_id = resolve_env(task)
-    env = gym.wrappers.FlattenObservation(gym.make(env_id, **load_config("tbc-hrl", task).env_kwargs))
+    env_kwargs = load_config("tbc-hrl", task, config).env_kwargs
+    for name, kind in kinds.items():
+        env = gym.wrappers.FlattenObservation(gym.make(env_id, **env_kwargs))
+        found.append(_flat(name, kind, env, model))
+    return found
+
+
+def _flat(name: str, kind: Any, env: gym.Env[Any, Any], model: TBCHRL) -> Contender:
     settings, ratio = model.low_settings, model.gradient_ratio
     flat = kind(
         "MlpPolicy",
@@ -121,9 +124,9 @@ def stretch(contender: Contender, steps: int) -> Speed:
     return Speed(time.process_time() - cpu, time.perf_counter() - wall, contender.done() - before)
 
 
-def speed(task: str, steps: int, rounds: int) -> Result:
+def speed(task: str, steps: int, rounds: int, config: str | None = None) -> Result:
     """Environment steps per second while learning, in turns; the first stretch of each is not counted."""
-    found = contenders(task)
+    found = contenders(task, config)
     for contender in found:
         stretch(contender, max(steps, 1000))
     runs: dict[str, list[Speed]] = {contender.name: [] for contender in found}
@@ -145,16 +148,17 @@ def speed(task: str, steps: int, rounds: int) -> Result:
     return lines, rows
 
 
-def split(task: str, steps: int, rounds: int) -> Result:
-    """Microseconds of a step in each part; medians over the rounds."""
-    model = ours(task)
+def split(task: str, steps: int, rounds: int, config: str | None = None, n_envs: int = 1) -> Result:
+    """Microseconds of an environment step in each part; medians over the rounds."""
+    model = ours(task, n_envs, config)
     model.learn(max(steps, 1000), reset_num_timesteps=False)
     runs = [profile(model, steps) for _ in range(rounds)]
     parts = {part: statistics.median(run[part] for run in runs) for part in PARTS}
+    share = statistics.median(sum(run[part] for part in OUTSIDE) / run["environment"] for run in runs)
     outside = sum(parts[part] for part in OUTSIDE)
-    share = outside / parts["environment"]
     lines = [
-        f"| {task}, microseconds per step | {' | '.join(PARTS)} | all but environment, batches, updates |",
+        f"| {task}, {n_envs} at once, microseconds per step | {' | '.join(PARTS)} |"
+        " all but environment, batches, updates |",
         "|---" * (len(PARTS) + 2) + "|",
         f"| | {' | '.join(f'{parts[p]:.1f}' for p in PARTS)} | {outside:.1f} = {share:.0%} of the environment's |",
     ]
@@ -223,9 +227,9 @@ def fill(model: TBCHRL, steps: int) -> None:
             buffer._extend({name: array[:room] for name, array in block.items()})
 
 
-def growth(task: str, steps: int, rounds: int) -> Result:
+def growth(task: str, steps: int, rounds: int, config: str | None = None) -> Result:
     """CPU time per step as the buffers fill: nearly empty, then full."""
-    model = ours(task)
+    model = ours(task, config=config)
     contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)
     stretch(contender, max(steps, 1000))
     figures: Figures = {}
@@ -251,11 +255,13 @@ def growth(task: str, steps: int, rounds: int) -> Result:
     return lines, figures
 
 
-def n_envs(task: str, steps: int, rounds: int, counts: Sequence[int] = (1, 2, 4, 8)) -> Result:
+def n_envs(
+    task: str, steps: int, rounds: int, config: str | None = None, counts: Sequence[int] = (1, 2, 4, 8)
+) -> Result:
     """CPU time per environment step over the number of environments side by side."""
     figures: Figures = {}
     for count in counts:
-        model = ours(task, count)
+        model = ours(task, count, config)
         contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)  # noqa: B023
         stretch(contender, max(steps, 1000))
         runs = [stretch(contender, steps * count) for _ in range(rounds)]
@@ -265,17 +271,17 @@ def n_envs(task: str, steps: int, rounds: int, counts: Sequence[int] = (1, 2, 4,
     return lines, figures
 
 
-def memory(task: str) -> Result:
+def memory(task: str, config: str | None = None) -> Result:
     """Peak memory of a whole process of its own that learns with full buffers."""
-    code = f"import sb3_tbc.benchmark_train as b; print(b.peak_memory({task!r}))"
+    code = f"import sb3_tbc.benchmark_train as b; print(b.peak_memory({task!r}, {config!r}))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     megabytes = float(done.stdout.split()[-1])
     return [f"{task}: {megabytes:.0f} MB, the whole process, buffers of the full budget"], {"megabytes": megabytes}
 
 
-def peak_memory(task: str) -> float:
+def peak_memory(task: str, config: str | None = None) -> float:
     """Learn, fill the buffers as the full budget would, learn on; the peak of this process in MB."""
-    model = ours(task, learning_starts=0)
+    model = ours(task, config=config, learning_starts=0)
     steps = 3 * round(model.rules.dt_max * model.rules.max_options)  # episodes
     model.learn(steps)
     fill(model, full_budget(task))
@@ -293,9 +299,9 @@ def full_budget(task: str) -> int:
     return load_config("tbc-hrl", resolve_env(task)[0]).n_timesteps
 
 
-def budget(task: str, steps: int, rounds: int) -> Result:
+def budget(task: str, steps: int, rounds: int, config: str | None = None) -> Result:
     """Time of the full budget: CPU time per step with full buffers, times the steps of table 1."""
-    model = ours(task, learning_starts=0)
+    model = ours(task, config=config, learning_starts=0)
     total = full_budget(task)
     contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)
     stretch(contender, max(steps, 1000))
@@ -324,14 +330,20 @@ def train(arguments: argparse.Namespace) -> Result:
         more, figures[name] = measure()
         lines.extend(["", *more])
 
-    steps, rounds = arguments.steps, arguments.rounds
+    steps, rounds, config = arguments.steps, arguments.rounds, arguments.config
     if "update" in arguments.what:
         keep("update", lambda: update(rounds))
-    measurements = {"speed": speed, "split": split, "growth": growth, "n-envs": n_envs, "budget": budget}
+    measurements = {
+        "speed": speed,
+        "split": partial(split, n_envs=arguments.n_envs),
+        "growth": growth,
+        "n-envs": n_envs,
+        "budget": budget,
+    }
     for task in arguments.tasks:
         for what in arguments.what:
             if what in measurements:
-                keep(f"{what} {task}", partial(measurements[what], task, steps, rounds))
+                keep(f"{what} {task}", partial(measurements[what], task, steps, rounds, config))
             elif what == "memory":
-                keep(f"memory {task}", partial(memory, task))
+                keep(f"memory {task}", partial(memory, task, config))
     return lines, figures

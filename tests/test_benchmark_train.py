@@ -46,11 +46,11 @@ def test_stopwatch_charges_the_innermost():
 def test_profile_adds_up_and_leaves_no_trace():
     model = benchmark_train.ours("Drawbridge", compile=False)
     before = {owner: dict(vars(owner)) for owner in (Collector, SACLevel, TBCHRL)}
-    start = time.perf_counter()
+    start = time.process_time()
     parts = profile(model, 200)
-    took = 1e6 * (time.perf_counter() - start) / 200
+    took = 1e6 * (time.process_time() - start) / 200
     assert set(parts) == set(PARTS) > set(OUTSIDE)
-    assert 0.5 * took < sum(parts.values()) <= took
+    assert 0.5 * took < sum(parts.values()) <= 1.05 * took
     assert all(parts[part] > 0 for part in ("environment", "acting", "bookkeeping"))
     assert {owner: dict(vars(owner)) for owner in before} == before
     assert "step" not in vars(model.env.envs[0].unwrapped)

@@ -123,9 +123,12 @@ class FrozenActor:
         self._dtype = np.float64 if average else np.float32
         self._net = freeze(actor, self._dtype)
         head: GaussianHead = actor.head
-        self._mean_bound = head.mean_bound
-        self._low, self._high = head.log_std_bounds
         self._dim = int(np.prod(actor.action_space.shape))
+        mean_bound = np.inf if head.mean_bound is None else head.mean_bound
+        low, high = head.log_std_bounds
+        self._lowest, self._highest = (
+            np.repeat(np.array(pair, dtype=np.float32), self._dim) for pair in ((-mean_bound, low), (mean_bound, high))
+        )
 
     def act(
         self, observations: FloatArray, states: FloatArray, deterministic: bool, rng: np.random.Generator
@@ -138,16 +141,15 @@ class FrozenActor:
         :param rng: source of the noise
         """
         outputs, next_states = self._current()(observations, states)
-        dim, bound = self._dim, self._mean_bound
-        mean = outputs[:, :dim]
-        if bound is not None:
-            mean = np.minimum(np.maximum(mean, -bound), bound)
+        dim = self._dim
+        bounded = np.minimum(np.maximum(outputs, self._lowest), self._highest)
+        chosen = bounded[:, :dim]
         if not deterministic:
-            std = np.exp(np.minimum(np.maximum(outputs[:, dim:], self._low), self._high))
-            std *= rng.standard_normal(mean.shape, dtype=np.float32)
-            std += mean
-            mean = std
-        return np.tanh(mean, dtype=self._dtype).astype(np.float32, copy=False), next_states
+            noise = np.exp(bounded[:, dim:])
+            noise *= rng.standard_normal(chosen.shape, dtype=np.float32)
+            noise += chosen
+            chosen = noise
+        return np.tanh(chosen, dtype=self._dtype).astype(np.float32, copy=False), next_states
 
     def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
         """States ``(n, state_dim)`` after a step with these observations."""

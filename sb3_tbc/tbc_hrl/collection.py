@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -59,7 +59,6 @@ class Collector:
     :param low: executes them
     :param exploration: see :class:`Exploration`
     :param rng: source of all randomness here
-    :param unscale: from the low level's unit actions to the environments'
     :param schedule: gives the time budgets where the high level does not
     """
 
@@ -72,10 +71,9 @@ class Collector:
         rules: OptionRules,
         exploration: Exploration,
         rng: np.random.Generator,
-        unscale: Callable[[FloatArray], FloatArray],
         schedule: Schedule | None = None,
     ) -> None:
-        self.high, self.low, self.rng, self.unscale = high, low, rng, unscale
+        self.high, self.low, self.rng = high, low, rng
         self.exploration = exploration
         self.env = HierarchicalVecEnv(venv, self.propose, layout, rules, low.state_dim, schedule)
         self.reset()
@@ -100,7 +98,7 @@ class Collector:
 
     def step(self) -> list[dict[str, Any]]:
         """One step of every environment; the infos it gave."""
-        observation, _, window_over, infos = self.env.step(self.unscale(self.act()))
+        observation, _, window_over, infos = self.env.step(self.env.unscale(self.act()))
         self.observation = np.asarray(observation)
         self.membrane = forget(self.membrane, self.exploration.memory, window_over, infos)
         return list(infos)

@@ -335,7 +335,6 @@ class TBCHRL(BaseAlgorithm):
             self.rules,
             self._exploration(),
             self.rng,
-            self.policy._unscale,
             self.schedule,
         )
         if resumed:

@@ -69,7 +69,8 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
         self._memory = (self._no_memory, self._no_memory)
         self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
-        self._low, self._range = self.action_space.low, self.action_space.high - self.action_space.low  # type: ignore[attr-defined]
+        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
+        self._centre, self._half = 0.5 * (low + high), 0.5 * (high - low)
         self._started = False
 
     def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
@@ -118,6 +119,11 @@ class HierarchicalVecEnv(VecEnvWrapper):
         """Membrane potentials before and after the coming step, ``(n_envs, state_dim)``, to be recorded with it."""
         self._memory = (states, next_states)
 
+    def unscale(self, unit_actions: FloatArray) -> FloatArray:
+        """The environments' actions for unit ones."""
+        actions: FloatArray = self._centre + self._half * unit_actions
+        return actions
+
     def step_async(self, actions: NDArray[Any]) -> None:
         """Step with actions in the environment's units.
 
@@ -125,7 +131,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         """
         if not self._started:
             raise HierarchyError("HierarchicalVecEnv.step was called before reset")
-        self._recorder.before_step(self._unit_actions(actions), *self._memory)
+        self._recorder.before_step((actions - self._centre) / self._half, *self._memory)
         self.venv.step_async(actions)
 
     def step_wait(self) -> VecEnvStepReturn:
@@ -141,9 +147,6 @@ class HierarchicalVecEnv(VecEnvWrapper):
             low_rewards[where] = self._close_options(where, seen, reached, dones, infos)
             self._next_options(where, observation, dones, infos)  # type: ignore[arg-type]
         return self._low_observation(observation), low_rewards, ended, infos  # type: ignore[arg-type]
-
-    def _unit_actions(self, actions: FloatArray) -> FloatArray:
-        return np.asarray(2.0 * (actions - self._low) / self._range - 1.0)
 
     def _before_reset(
         self, observation: GoalObservation, dones: NDArray[np.bool_], infos: list[dict[str, Any]]
