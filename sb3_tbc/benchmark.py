@@ -29,7 +29,7 @@ def build_parser() -> Parser:
     train = commands.add_parser("train", help="training speed beside SB3's SAC and SBX's, and where the time goes")
     train.add_argument("tasks", nargs="*", default=["Pendulum", "Drawbridge"], metavar="TASK")
     train.add_argument("--what", nargs="+", default=["speed", "split", "update"], metavar="WHAT",
-                       help="of speed, split, update, growth, n-envs, memory, budget")  # fmt: skip
+                       help="of speed, split, floor, update, growth, n-envs, memory, budget")  # fmt: skip
     train.add_argument(
         "--config", choices=CONFIGS, help="which values of the tasks' settings; tuned where there are any"
     )

@@ -21,6 +21,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from sb3_tbc.benchmark_floor import gemm_rate, products
 from sb3_tbc.benchmark_profile import OUTSIDE, PARTS, profile
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.tbc_hrl import TBCHRL
@@ -29,7 +30,7 @@ from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import RunConfig, load_config
 from sb3_tbc.zoo.environments import make_envs, resolve_env
 
-WHAT = ("speed", "split", "update", "growth", "n-envs", "memory", "budget")
+WHAT = ("speed", "split", "floor", "update", "growth", "n-envs", "memory", "budget")
 BUDGET_MINUTES = {
     "Pendulum": 5,
     "UR5Reacher": 12,
@@ -163,6 +164,35 @@ def split(task: str, steps: int, rounds: int, config: str | None = None, n_envs:
         f"| | {' | '.join(f'{parts[p]:.1f}' for p in PARTS)} | {outside:.1f} = {share:.0%} of the environment's |",
     ]
     return lines, {"parts": parts, "outside": outside, "share_of_environment": share}
+
+
+def floor(task: str, steps: int, rounds: int, config: str | None = None) -> Result:
+    """A step beside what it cannot do without: the environment's own step and the updates' matrix products."""
+    model = ours(task, config=config)
+    model.learn(max(steps, 1000), reset_num_timesteps=False)
+    runs = [profile(model, steps) for _ in range(rounds)]
+    step = statistics.median(sum(run.values()) for run in runs)
+    environment = statistics.median(run["environment"] for run in runs)
+    levels = {"high": model.high_settings["batch_size"], "low": model.low_settings["batch_size"]}
+    done = {name: products(getattr(model, name), batch, rounds) for name, batch in levels.items()}
+    rate, ratio = gemm_rate(rounds), model.gradient_ratio
+    own = ratio * sum(level.microseconds for level in done.values())
+    best = ratio * 1e6 * sum(level.flops for level in done.values()) / rate
+    figures: Figures = {
+        "step": step, "environment": environment, "products": own, "products_at_best_rate": best,
+        "gflops_per_second": rate / 1e9, "levels": {name: level._asdict() for name, level in done.items()},
+    }  # fmt: skip
+    counts = ", ".join(f"{v.number} of {v.flops / 1e6:.1f} MFLOP on the {k} level" for k, v in done.items())
+    lines = [
+        f"| {task}, microseconds per step | environment | products, as fast as their shapes allow |"
+        f" the same at {rate / 1e9:.0f} GFLOP/s | floor | a step | times the floor |",
+        "|---" * 7 + "|",
+        f"| | {environment:.1f} | {own:.1f} | {best:.1f} | {environment + own:.1f} | {step:.1f} |"
+        f" {step / (environment + own):.2f} |",
+        "",
+        f"Products of an update: {counts}; {ratio:g} updates of each level per step.",
+    ]
+    return lines, figures
 
 
 def update(rounds: int, batch_size: int = 256, burst: int = 64) -> Result:
@@ -333,13 +363,10 @@ def train(arguments: argparse.Namespace) -> Result:
     steps, rounds, config = arguments.steps, arguments.rounds, arguments.config
     if "update" in arguments.what:
         keep("update", lambda: update(rounds))
-    measurements = {
-        "speed": speed,
-        "split": partial(split, n_envs=arguments.n_envs),
-        "growth": growth,
-        "n-envs": n_envs,
-        "budget": budget,
-    }
+    measurements: dict[str, Callable[..., Result]] = {
+        "speed": speed, "split": partial(split, n_envs=arguments.n_envs), "floor": floor, "growth": growth,
+        "n-envs": n_envs, "budget": budget,
+    }  # fmt: skip
     for task in arguments.tasks:
         for what in arguments.what:
             if what in measurements:

@@ -5,9 +5,11 @@ import time
 
 import numpy as np
 import pytest
+import torch as th
 
 from sb3_tbc import benchmark_train
 from sb3_tbc.benchmark import benchmark
+from sb3_tbc.benchmark_floor import products
 from sb3_tbc.benchmark_profile import OUTSIDE, PARTS, Stopwatch, profile
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.tbc_hrl.collection import Collector
@@ -75,3 +77,25 @@ def test_further_measurements_run(what, monkeypatch):
     lines, figures = getattr(benchmark_train, what)("Drawbridge", 20, 1)
     assert lines
     assert figures
+
+
+def test_products_of_an_update_are_counted_and_the_level_is_left_alone():
+    model = benchmark_train.ours("Drawbridge", compile=False)
+    before = {name: x.clone() for name, x in model.high.policy.state_dict().items()}
+    found = products(model.high, 16, 1)
+    assert all(th.equal(before[name], x) for name, x in model.high.policy.state_dict().items())
+    n_obs, n_act, hidden = model.high.observation_space.shape[0], model.high.action_space.shape[0], 32
+    actor = n_obs * hidden + hidden**2 + hidden * 2 * n_act
+    critics = 2 * ((n_obs + n_act) * hidden + hidden**2 + hidden)
+    forward = 2 * actor + 3 * critics  # actions now and next; targets, the critics' own update, the actor's loss
+    # backward: products for the weights and, but for the input layer, for what the layer saw
+    inputs = n_obs * hidden, 2 * (n_obs + n_act) * hidden
+    backward = 2 * actor - inputs[0] + 2 * critics - inputs[1] + critics
+    assert found.flops == pytest.approx(2 * 16 * (forward + backward))
+    assert found.microseconds > 0
+
+
+def test_floor_is_below_a_step():
+    lines, figures = benchmark_train.floor("Drawbridge", 60, 1)
+    assert any("times the floor" in line for line in lines)
+    assert 0 < figures["environment"] + figures["products"] < figures["step"]

@@ -283,11 +283,18 @@ class SACUpdate:
             self.compile = compile
             self._steps.clear()
 
+    def _example(self, batch_size: int, ent_coef: th.Tensor) -> list[th.Tensor]:
+        """Arguments of the step: the state itself, and a batch of zeros."""
+        per_step = [th.zeros(shape[1:]) for shape in self._shapes(1, batch_size).values()]
+        return [th.zeros(len(DIAGNOSTICS)), ent_coef.data, *self._state(), *per_step]
+
     def prepare(self, batch_size: int, ent_coef: th.Tensor) -> None:
         """Compile for a batch size now rather than at the first update."""
-        shapes = self._shapes(1, batch_size).values()
-        example = [th.zeros(shape[1:]) for shape in shapes]
-        self._step_for([th.zeros(len(DIAGNOSTICS)), ent_coef.data, *self._state(), *example])
+        self._step_for(self._example(batch_size, ent_coef))
+
+    def rehearse(self, batch_size: int, ent_coef: th.Tensor) -> None:
+        """One update on copies, eagerly, for those who want to watch its operations."""
+        self._step(*(tensor.clone() for tensor in self._example(batch_size, ent_coef)))
 
     def _step(self, *tensors: th.Tensor) -> None:
         """One update; everything of :class:`StepInputs` before ``constants`` is changed in place."""
