@@ -19,7 +19,7 @@ INITIAL_RANGES = {
     "gain": (2.0, 4.0),
     "input_conductance": (0.5, 1.0),
 }
-"""Initial values are uniform in these; fits of random teachers barely depend on them (docs/ndbcnet.md)."""
+"""Initial values are uniform in these."""
 
 
 class ConductanceArrays(NamedTuple):
