@@ -132,19 +132,19 @@ def new_settings(args: argparse.Namespace) -> StudySettings:
 
 
 def baselines(args: argparse.Namespace, task: str, env_id: str, fixed: dict[str, Any]) -> dict[str, RunConfig]:
-    """The configurations of the first trials: the paper's row and the shipped tuned one, or the defaults.
+    """The configurations of the first trials: the paper's row and the shipped tuned one, or what ``train`` would run.
 
     :raises ConfigError: if one of them cannot be built
     """
     known = task in read_file(args.config_file or config_file(args.algo))
-    names = list(CONFIGS) if known else ["paper"]
+    names: list[str | None] = list(CONFIGS) if known else [args.config]
     runs: dict[str, RunConfig] = {}
     for name in names:
         run = load_config(args.algo, task, name, fixed, path=args.config_file)
         run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
         run = _checked(run, env_id)
         if not any(run.model == other.model and run.env_kwargs == other.env_kwargs for other in runs.values()):
-            runs[name if known else "default"] = run
+            runs[name if known and name else "default"] = run
     return runs
 
 

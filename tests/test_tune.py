@@ -88,6 +88,18 @@ def test_the_paper_and_the_tuned_row_come_first(tmp_path: Path) -> None:
     assert settings.first_trials()["tuned"]["learning_rate_schedule"] == "linear"
 
 
+@pytest.mark.parametrize("config", [None, "paper"])
+def test_an_unknown_task_begins_with_what_train_would_run(tmp_path: Path, config: str | None) -> None:
+    given = ["--config", config] if config else []
+    settings = tune.new_settings(tune.build_parser().parse_args(arguments(tmp_path, *given)))
+    plain = load_config("tbc-hrl", "TunedCorridor-v0", config).model
+    assert {key: settings.run.model[key] for key in plain if key != "low"} == {
+        key: value for key, value in plain.items() if key != "low"
+    }
+    assert settings.run.model["memory"] == ("window" if config else "none")
+    assert list(settings.first_trials()) == ["default"]
+
+
 def test_what_is_left_behind(searched: Path) -> None:
     folder = searched / NAME
     with (folder / "trials.csv").open() as file:
