@@ -55,7 +55,7 @@ def compile_step(step: Callable[..., None], example: Sequence[th.Tensor], compil
             problem = f"compiling failed with {type(error).__name__}: {str(error).strip().splitlines()[:1]}"
     if compile is True:
         raise RuntimeError(f"compile=True, but {problem}; install g++ or clang++, or use compile='auto' or False")
-    logger.warning("updates run eagerly, about 4 times slower than compiled: %s", problem)
+    logger.warning("updates run eagerly, several times slower than compiled: %s", problem)
     return step
 
 

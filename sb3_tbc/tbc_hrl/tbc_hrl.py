@@ -26,6 +26,7 @@ from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import OptionRules
 from sb3_tbc.spaces import SubgoalSpace
 from sb3_tbc.tbc_hrl import resume
+from sb3_tbc.tbc_hrl.bar import described, progress_bar_of
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, Exploration, goal_test_of
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.level import SACLevel
@@ -317,7 +318,7 @@ class TBCHRL(BaseAlgorithm):
     ) -> SelfTBCHRL:
         """Collect whole episodes, then update both levels in a burst, until ``total_timesteps`` steps are done."""
         resumed, self._resumed = {} if reset_num_timesteps else self._resumed, {}
-        self._prepare_updates(total_timesteps + (self.num_timesteps if resumed else 0))
+        planned = total_timesteps + (self.num_timesteps if resumed else 0)
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -340,6 +341,7 @@ class TBCHRL(BaseAlgorithm):
         if resumed:
             resume.set_state(self, collector, resumed)
         callback.on_training_start(locals(), globals())
+        self._prepare_updates(planned, progress_bar_of(callback))
         while self.num_timesteps < total_timesteps:
             if not self.collect_rollouts(collector, callback, total_timesteps):
                 break
@@ -349,14 +351,21 @@ class TBCHRL(BaseAlgorithm):
         callback.on_training_end()
         return self
 
-    def _prepare_updates(self, total_timesteps: int) -> None:
-        """Compile before the clock starts, so that neither speed nor progress bar counts it."""
+    def _prepare_updates(self, total_timesteps: int, bar: Any | None) -> None:
+        """Compile now; the progress bar says so, and the logged speed does not count it.
+
+        :param total_timesteps: environment steps to come, and those before a resumed run was stopped
+        :param bar: the progress bar, if there is one
+        """
         few = self.gradient_ratio * total_timesteps < MIN_UPDATES_TO_COMPILE
         compile = False if self.compile == "auto" and few else self.compile
         for level, settings in ((self.high, self.high_settings), (self.low, self.low_settings)):
-            seconds = level.prepare(settings["batch_size"], compile)
+            name = level.log_prefix[:-1]
+            with described(bar, f"compiling the {name} level's update" if compile else ""):
+                seconds = level.prepare(settings["batch_size"], compile)
             if self.verbose and level.compiled:
-                print(f"{level.log_prefix[:-1]} level: update compiled in {seconds:.0f} s")
+                print(f"{name} level: update compiled in {seconds:.0f} s")
+        self.start_time = time.time_ns()
 
     def _exploration(self) -> Exploration:
         return Exploration(self.random_fraction, self.testing_fraction, self.deterministic_testing, self.memory)
