@@ -7,6 +7,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -330,6 +332,20 @@ def test_a_baseline_queued_twice_runs_once(tmp_path: Path, monkeypatch: pytest.M
     assert [t.state for t in study.trials] == [TrialState.COMPLETE, TrialState.FAIL, TrialState.COMPLETE]
     assert [t.user_attrs.get(ORIGIN) for t in study.trials] == ["default", "default", None]
     assert seeds == [0, 1, 0, 1]
+
+
+def test_a_study_that_another_machine_is_just_creating_is_joined(tmp_path: Path) -> None:
+    args = tune.build_parser().parse_args(arguments(tmp_path, *SHORT, *TINY))
+    wanted, storage = tune.new_settings(args), open_storage(str(tmp_path / "study.log"))
+    other = optuna.create_study(storage=storage, study_name="shared", direction="maximize")
+    later = threading.Timer(0.5, other.set_user_attr, ("settings", asdict(wanted)))
+    later.start()
+    _, settings = studies.open_study(storage, "shared", "study.log", wanted, {})
+    later.join()
+    assert settings.run == wanted.run
+    optuna.create_study(storage=storage, study_name="foreign", direction="maximize").ask()
+    with pytest.raises(studies.ConfigError, match="was not made by this command"):
+        studies.open_study(storage, "foreign", "study.log", wanted, {})
 
 
 def test_ctrl_c_in_a_background_script_is_not_for_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:

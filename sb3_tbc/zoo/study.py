@@ -252,12 +252,11 @@ def open_study(
         if wanted is None:
             there = f"; {nearest(name, known)}" if known else "; it holds no study yet"
             raise ConfigError(f"no study {name!r} in {where}{there}")
-        try:
+        with contextlib.suppress(optuna.exceptions.DuplicatedStudyError):  # another machine was faster
             study = optuna.create_study(storage=storage, study_name=name, direction=wanted.direction)
             study.set_user_attr(SETTINGS, asdict(wanted))
-        except optuna.exceptions.DuplicatedStudyError:
-            _wait_for_settings(optuna.load_study(study_name=name, storage=storage))
     study = optuna.load_study(study_name=name, storage=storage)
+    _wait_for_settings(study)
     settings = read_settings(study)
     check_same(settings, name, asked)
     queue_first_trials(study, settings)
@@ -265,9 +264,9 @@ def open_study(
 
 
 def _wait_for_settings(study: Study) -> None:
-    """Another machine is creating the same study this very moment."""
-    for _ in range(100):
-        if SETTINGS in study.user_attrs:
+    """A study without trials and settings is being created by another machine this very moment."""
+    for _ in range(200):
+        if SETTINGS in study.user_attrs or study.get_trials(deepcopy=False):
             return
         time.sleep(0.1)
 
