@@ -80,6 +80,7 @@ def contenders(task: str, config: str | None = None) -> list[Contender]:
     the task's observation as one flat vector, which is what they are fastest on.
     """
     model = ours(task, config=config)
+    warm_up(model, 1000)
     found = [Contender("TBC-HRL", lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)]
     from stable_baselines3 import SAC
 
@@ -108,6 +109,16 @@ def _flat(name: str, kind: Any, env: gym.Env[Any, Any], model: TBCHRL) -> Conten
         seed=0,
     )
     return Contender(name, lambda n: flat.learn(n, reset_num_timesteps=False), lambda: int(flat.num_timesteps))
+
+
+def warm_up(model: TBCHRL, steps: int) -> None:
+    """Learn until both levels do: a level begins to update when its buffer holds a batch."""
+    model.learn(max(steps, 1000), reset_num_timesteps=False)
+    batches = [settings["batch_size"] for settings in (model.high_settings, model.low_settings)]
+    while model.num_timesteps <= model.learning_starts or any(
+        buffer.size() < batch for buffer, batch in zip(model.replay_buffer, batches, strict=True)
+    ):
+        model.learn(steps, reset_num_timesteps=False)
 
 
 class Speed(NamedTuple):
@@ -152,7 +163,7 @@ def speed(task: str, steps: int, rounds: int, config: str | None = None) -> Resu
 def split(task: str, steps: int, rounds: int, config: str | None = None, n_envs: int = 1) -> Result:
     """Microseconds of an environment step in each part; medians over the rounds."""
     model = ours(task, n_envs, config)
-    model.learn(max(steps, 1000), reset_num_timesteps=False)
+    warm_up(model, steps)
     runs = [profile(model, steps) for _ in range(rounds)]
     parts = {part: statistics.median(run[part] for run in runs) for part in PARTS}
     share = statistics.median(sum(run[part] for part in OUTSIDE) / run["environment"] for run in runs)
@@ -169,7 +180,7 @@ def split(task: str, steps: int, rounds: int, config: str | None = None, n_envs:
 def floor(task: str, steps: int, rounds: int, config: str | None = None) -> Result:
     """A step beside what it cannot do without: the environment's own step and the updates' matrix products."""
     model = ours(task, config=config)
-    model.learn(max(steps, 1000), reset_num_timesteps=False)
+    warm_up(model, steps)
     runs = [profile(model, steps) for _ in range(rounds)]
     step = statistics.median(sum(run.values()) for run in runs)
     environment = statistics.median(run["environment"] for run in runs)
@@ -261,7 +272,7 @@ def growth(task: str, steps: int, rounds: int, config: str | None = None) -> Res
     """CPU time per step as the buffers fill: nearly empty, then full."""
     model = ours(task, config=config)
     contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)
-    stretch(contender, max(steps, 1000))
+    warm_up(model, steps)
     figures: Figures = {}
     for name in ("empty", "full"):
         if name == "full":
@@ -293,7 +304,7 @@ def n_envs(
     for count in counts:
         model = ours(task, count, config)
         contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)  # noqa: B023
-        stretch(contender, max(steps, 1000))
+        warm_up(model, steps)
         runs = [stretch(contender, steps * count) for _ in range(rounds)]
         figures[str(count)] = statistics.median(1e6 * s.cpu / s.steps for s in runs)
     lines = [f"| {task}, environments | {' | '.join(figures)} |", "|---" * (len(figures) + 1) + "|"]

@@ -81,15 +81,20 @@ class OptionReplayBuffer(RingBuffer):
         if self.teacher is None:
             raise HierarchyError("labelled samples need a teacher: set replay_buffer.teacher")
         at = self.rng.integers(0, self.size(), gradient_steps * batch_size)
-        labels = self.teacher(*(self.data[name][at] for name in ("observations", "local", "here")))
-        parts = [*self._rows(at), np.asarray(labels, dtype=np.float32)]
+        taken = self._take(at)
+        labels = self.teacher(*(taken[name] for name in ("observations", "local", "here")))
+        parts = [*self._batch(taken), np.asarray(labels, dtype=np.float32)]
         shape = (gradient_steps, batch_size, -1)
         *batch, labels_ = (th.from_numpy(part).view(shape).to(self.device) for part in parts)
         return LevelBatch(*batch), labels_
 
     def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
-        no_state = np.zeros((len(at), 0), dtype=np.float32)
-        return (*(self.data[name][at] for name in LevelBatch._fields[:6]), no_state, no_state)
+        return self._batch(self._take(at))
+
+    @staticmethod
+    def _batch(taken: dict[str, Float32]) -> tuple[Float32, ...]:
+        no_state = np.zeros((len(taken["rewards"]), 0), dtype=np.float32)
+        return (*(taken[name] for name in LevelBatch._fields[:6]), no_state, no_state)
 
 
 class SubgoalReplayBuffer(RingBuffer):
@@ -189,27 +194,27 @@ class SubgoalReplayBuffer(RingBuffer):
         return ReachPairs(data["local"][at], data["here"][at], goal, first.astype(np.float32))
 
     def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
-        data = self.data
         at, where, second = self._timed(at) if self.hindsight == "timed" else self._untimed(at)
-        subgoal, time_left = data["subgoal"][at], data["time_left"][at]
-        rewards, dones = data["rewards"][at], data["dones"][at]
-        subgoal[where] = data["achieved"][second]
+        taken = self._take(at)
+        subgoal, time_left, rewards, dones = (taken[name] for name in ("subgoal", "time_left", "rewards", "dones"))
+        subgoal[where] = self.data["achieved"][second]
         expired = second == at[where]
         if self.hindsight == "timed":
             ahead = (second - at[where]) % self.buffer_size
             time_left[where, 0] = ahead + 1 - self.rng.random(len(where), dtype=np.float32)
-        rewards[where, 0], dones[where, 0] = self._relabelled(at[where], subgoal[where], expired)
+        here, achieved = taken["here"], taken["achieved"]
+        rewards[where, 0], dones[where, 0] = self._relabelled(here[where], achieved[where], subgoal[where], expired)
         scale = np.float32(1.0 / self.rules.dt_max)
         now, later = (np.clip(t * scale, 0.0, 1.0) for t in (time_left, time_left - 1.0))
-        observations = self.layout.low_from(data["local"][at], data["here"][at], subgoal, now)
+        observations = self.layout.low_from(taken["local"], here, subgoal, now)
         return (
             observations,
-            data["actions"][at],
-            self.layout.low_from(data["next_local"][at], data["achieved"][at], subgoal, later),
+            taken["actions"],
+            self.layout.low_from(taken["next_local"], achieved, subgoal, later),
             rewards,
             dones,
             np.full_like(rewards, self.gamma),
-            *self._states(at, subgoal, time_left, observations),
+            *self._states(at, taken, observations),
         )
 
     def _timed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -238,28 +243,33 @@ class SubgoalReplayBuffer(RingBuffer):
         return at, where, (begin[where] + second) % self.buffer_size
 
     def _relabelled(
-        self, at: NDArray[np.int64], subgoal: Float32, expired: NDArray[np.bool_]
+        self, here: Float32, achieved: Float32, subgoal: Float32, expired: NDArray[np.bool_]
     ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
         """Rewards and ends of relabelled steps."""
         if self.reward.kind == "sparse" and self.rules.window_end == "timed":
             return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
-        return self.reward.of(self.data["here"][at], self.data["achieved"][at], subgoal, expired)
+        return self.reward.of(here, achieved, subgoal, expired)
 
     def _states(
-        self, at: NDArray[np.int64], subgoal: Float32, time_left: Float32, observations: Float32
+        self, at: NDArray[np.int64], taken: dict[str, Float32], observations: Float32
     ) -> tuple[Float32, Float32]:
-        """Memory states before and after the sampled steps: the stored ones, or recomputed by a burn-in."""
+        """Memory states before and after the sampled steps: the stored ones, or recomputed by a burn-in.
+
+        :param taken: the sampled rows, with the subgoals and times that they are relabelled with
+        """
         if self.sequence_length == 1 or self.advance is None:
-            return self.data["states"][at], self.data["next_states"][at]
-        position, length = (self.data[name][at, 0].astype(np.int64) for name in ("position", "length"))
+            return taken["states"], taken["next_states"]
+        position, length = (taken[name][:, 0].astype(np.int64) for name in ("position", "length"))
         back = np.minimum(position, self.sequence_length - 1)
         back[~self._intact(at - position, length)] = 0
         states = self.data["states"][(at - back) % self.buffer_size]
         for steps in range(self.sequence_length - 1, 0, -1):
             rows = np.flatnonzero(back >= steps)
             earlier = (at[rows] - steps) % self.buffer_size
-            left = np.clip((time_left[rows] + steps) / np.float32(self.rules.dt_max), 0.0, 1.0)
-            seen = self.layout.low_from(self.data["local"][earlier], self.data["here"][earlier], subgoal[rows], left)
+            left = np.clip((taken["time_left"][rows] + steps) / np.float32(self.rules.dt_max), 0.0, 1.0)
+            seen = self.layout.low_from(
+                self.data["local"][earlier], self.data["here"][earlier], taken["subgoal"][rows], left
+            )
             states[rows] = self.advance(seen, states[rows])
         return states, self.advance(observations, states)
 

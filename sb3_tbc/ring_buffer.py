@@ -35,9 +35,10 @@ def write_arrays(path: str | pathlib.Path | io.BufferedIOBase, arrays: Mapping[s
 
 
 class RingBuffer(BaseBuffer):
-    """A ring of rows, one array per quantity, that grows up to ``buffer_size`` as it fills.
+    """A ring of rows. A row's quantities lie side by side: a draw reads one place of the memory, not a dozen.
 
-    SB3's ``SAC.train`` can sample from it as from any replay buffer; :meth:`sample_burst` is the fast way.
+    The memory is asked for at once; the system hands it out as rows are written. SB3's ``SAC.train`` can sample from
+    it as from any replay buffer; :meth:`sample_burst` is the fast way.
 
     :param buffer_size: rows to keep; the oldest are overwritten
     :param seed: seed of the sampling
@@ -54,7 +55,22 @@ class RingBuffer(BaseBuffer):
     ) -> None:
         super().__init__(buffer_size, observation_space, action_space, device, n_envs=1)
         self.rng = np.random.default_rng(seed)
-        self.data = {name: np.zeros((0, width), dtype=np.float32) for name, width in widths.items()}
+        ends = np.cumsum(list(widths.values())).tolist()
+        self._columns = {name: slice(end - widths[name], end) for name, end in zip(widths, ends, strict=True)}
+        self._table = np.zeros((buffer_size, ends[-1]), dtype=np.float32)
+
+    @property
+    def data(self) -> dict[str, Float32]:
+        """Views of all rows, by quantity."""
+        return self._split(self._table)
+
+    def _split(self, rows: Float32) -> dict[str, Float32]:
+        """Views of whole rows ``(n, .)``, one per quantity."""
+        return {name: rows[:, columns] for name, columns in self._columns.items()}
+
+    def _take(self, at: NDArray[np.int64]) -> dict[str, Float32]:
+        """Copies of rows, by quantity."""
+        return self._split(self._table.take(at, axis=0))
 
     def size(self) -> int:
         """Number of rows stored."""
@@ -73,21 +89,11 @@ class RingBuffer(BaseBuffer):
             raise ValueError(
                 f"an episode of {count} rows does not fit a buffer of {self.buffer_size}; raise buffer_size"
             )
-        self._reserve(min(self.pos + count, self.buffer_size))
         at = (self.pos + np.arange(count)) % self.buffer_size
         for name, array in self.data.items():
             array[at] = np.asarray(rows[name], dtype=np.float32).reshape(count, array.shape[1])
         self.full = self.full or self.pos + count >= self.buffer_size
         self.pos = (self.pos + count) % self.buffer_size
-
-    def _reserve(self, rows: int) -> None:
-        held = len(next(iter(self.data.values())))
-        if rows > held:
-            room = min(max(rows, 2 * held, 4096), self.buffer_size)
-            for name, array in self.data.items():
-                grown = np.zeros((room, array.shape[1]), dtype=np.float32)
-                grown[:held] = array
-                self.data[name] = grown
 
     def sample_burst(self, gradient_steps: int, batch_size: int) -> LevelBatch:
         """Independent uniform batches for ``gradient_steps`` updates, tensors ``(gradient_steps, batch_size, .)``."""
@@ -127,7 +133,6 @@ class RingBuffer(BaseBuffer):
         rows = len(state[next(iter(self.data))])
         if rows > self.buffer_size:
             raise ValueError(f"saved replay buffer has {rows} rows, this one has room for {self.buffer_size}")
-        self._reserve(rows)
         for name, array in self.data.items():
             array[:rows] = state[name]
         self.full = bool(state["full"]) and rows == self.buffer_size

@@ -2,6 +2,7 @@
 
 import json
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,12 +17,15 @@ from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 
+WARM_UP = benchmark_train.warm_up
+
 
 @pytest.fixture(autouse=True)
 def eager(monkeypatch):
-    """Neither compile nor move the test process to one core."""
+    """Neither compile nor move the test process to one core, nor wait for levels that fill their buffers slowly."""
     monkeypatch.setattr(benchmark_train, "compiler_problem", lambda: "not in tests")
     monkeypatch.setattr(benchmark_train, "one_core", lambda: None)
+    monkeypatch.setattr(benchmark_train, "warm_up", lambda model, steps: model.learn(steps))
 
 
 def test_command_prints_and_writes_json(tmp_path, capsys):
@@ -37,12 +41,12 @@ def test_command_prints_and_writes_json(tmp_path, capsys):
         benchmark(["train", "--what", "sped"])
 
 
-def test_stopwatch_charges_the_innermost():
+def test_stopwatch_charges_the_innermost(monkeypatch):
+    readings = iter([0.0, 1.0, 3.0, 6.0])  # outer begins, inner begins, inner ends, outer ends
+    monkeypatch.setattr("sb3_tbc.benchmark_profile.time.perf_counter", lambda: next(readings))
     watch = Stopwatch()
-    inner = watch.timed("inner", lambda: time.sleep(0.02))
-    outer = watch.timed("outer", lambda: (time.sleep(0.005), inner()))
-    outer()
-    assert watch.seconds["inner"] >= 0.02 > watch.seconds["outer"] >= 0.005
+    watch.timed("outer", watch.timed("inner", lambda: None))()
+    assert watch.seconds == {"outer": 4.0, "inner": 2.0}
 
 
 def test_profile_adds_up_and_leaves_no_trace():
@@ -95,7 +99,21 @@ def test_products_of_an_update_are_counted_and_the_level_is_left_alone():
     assert found.microseconds > 0
 
 
-def test_floor_is_below_a_step():
-    lines, figures = benchmark_train.floor("Drawbridge", 60, 1)
+def test_floor_is_below_a_step(monkeypatch):
+    level = {"batch_size": 8, "policy_kwargs": {"net_arch": [32, 32]}}
+    monkeypatch.setattr(benchmark_train, "ours", partial(benchmark_train.ours, high=level, low=level))
+    monkeypatch.setattr(benchmark_train, "warm_up", WARM_UP)
+    lines, figures = benchmark_train.floor("Pendulum", 200, 1)
     assert any("times the floor" in line for line in lines)
     assert 0 < figures["environment"] + figures["products"] < figures["step"]
+
+
+def test_warming_up_ends_when_both_levels_learn():
+    low = {"batch_size": 8, "policy_kwargs": {"net_arch": [32, 32]}}
+    model = benchmark_train.ours("Pendulum", high={**low, "batch_size": 40}, low=low, learning_starts=1100)
+    WARM_UP(model, 200)
+    assert model.num_timesteps > 1100
+    assert model.replay_buffer.high.size() >= 40
+    model.learn(100, reset_num_timesteps=False)
+    assert model.high._n_updates > 0
+    assert model.low._n_updates > 0
