@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# PostgreSQL for the search's database test (tests/test_tune_postgres.py), from Debian's own packages. The test starts a
+# PostgreSQL for the search's database test (tests/test_tune_workers.py), from Debian's own packages. The test starts a
 # private server of its own; the packaged cluster is neither started nor touched.
 set -eu
 if command -v postgres >/dev/null 2>&1 || ls /usr/lib/postgresql/*/bin/postgres >/dev/null 2>&1; then
