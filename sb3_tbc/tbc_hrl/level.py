@@ -24,8 +24,8 @@ from sb3_tbc.type_aliases import LevelBatch
 
 FloatArray = NDArray[np.floating[Any]]
 
-BURST = 128
-"""Updates whose batches are gathered at once; bounds the memory of a long burst."""
+BURST_ROWS = 32_768
+"""Transitions that are gathered at once, for several updates; many more no longer fit the caches."""
 
 
 class BurstBuffer(Protocol):
@@ -178,8 +178,9 @@ class SACLevel(SAC):
         self.policy.set_training_mode(True)
         self._set_learning_rates()
         sums: dict[str, float] = {}
-        for start in range(0, gradient_steps, BURST):
-            steps = min(BURST, gradient_steps - start)
+        burst = max(1, BURST_ROWS // batch_size)
+        for start in range(0, gradient_steps, burst):
+            steps = min(burst, gradient_steps - start)
             for key, value in self._run(steps, batch_size).items():
                 sums[key] = sums.get(key, 0.0) + steps * value
             self.policy.after_updates(steps)
