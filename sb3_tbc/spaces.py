@@ -30,7 +30,7 @@ class SubgoalSpace:
     :param event: index into the task's ``observation`` of a flag that is 1 in just the step of a decisive event, at
         which control returns to the high level and which gives the goal of hindsight where ``goal_strategy`` is
         ``"event"``; None where the task has no such event
-    :raises ValueError: if bounds, thresholds and groups do not fit together
+    :raises ValueError: if bounds, thresholds and groups do not fit together, or the event is no index
     """
 
     event: int | None = None  # also of spaces in agents that were saved before there were events
@@ -69,6 +69,10 @@ class SubgoalSpace:
             raise ValueError(f"{self.dim} subgoal coordinates need as many names, got {self.names}")
         if self.thresholds.shape != (len(self.groups),) or not np.all(self.thresholds > 0):
             raise ValueError(f"need one positive threshold per group {self.groups}, got {self.thresholds}")
+        if self.event is not None and (not isinstance(self.event, int) or self.event < 0):
+            raise ValueError(
+                f"event must be the index of a flag in the observation, counted from 0, got {self.event!r}"
+            )
         if sorted(i for g in self.groups for i in g) != list(range(self.dim)):
             raise ValueError(f"groups must use each of the {self.dim} coordinates once, got {self.groups}")
 

@@ -126,6 +126,9 @@ def test_tennis_has_one_event_in_an_episode() -> None:
 
 
 def test_mistakes() -> None:
+    for wrong in (-1, "bell", 1.5):
+        with pytest.raises(ValueError, match="event must be the index of a flag"):
+            SubgoalSpace([-1.0], [1.0], [0.05], achieved, local, [1.0], ["position"], event=wrong)
     with pytest.raises(ValueError, match="this task names none"):
         check_goal_strategy("event", Corridor().subgoals)
     with pytest.raises(ValueError, match="this task names none"):

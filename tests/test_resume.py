@@ -103,13 +103,15 @@ def test_with_all_that_has_randomness_of_its_own(tmp_path):
     check("Pendulum", tmp_path, 2, 1500, 4000, duration_loss_coef=0.1, memory="window", sequence_length=3)
 
 
-def test_states_of_another_moment_are_left_alone(tmp_path):
+def test_states_of_another_moment_are_left_alone(tmp_path, caplog):
     model = make("Pendulum", make_envs("sb3_tbc/Pendulum-v0", 1, 0)).learn(1200)
     model.save_replay_buffer(tmp_path / "replay.npz")
     other = make("Pendulum", make_envs("sb3_tbc/Pendulum-v0", 1, 0)).learn(300)
     other.load_replay_buffer(tmp_path / "replay.npz")
     before = other.high.noise_rng.bit_generator.state
-    other.learn(1, reset_num_timesteps=False)
+    with caplog.at_level(logging.WARNING):
+        other.learn(1, reset_num_timesteps=False)
+    assert f"saved after {model.num_timesteps} steps, the agent after" in caplog.text
     assert other.high.noise_rng.bit_generator.state == before
     assert other.replay_buffer.low.size() == model.replay_buffer.low.size()
 

@@ -60,11 +60,17 @@ def get_state(model: TBCHRL) -> Arrays:
 def set_state(model: TBCHRL, collector: Collector, state: Mapping[str, NDArray[Any]]) -> bool:
     """Go on where :func:`get_state` was taken; False if the state is of another moment, and nothing was changed.
 
+    The log says so: weights and replay of different moments make a run that goes on, but not the one that was saved.
     Where the environments cannot be brought back to where they were, everything else goes on and they begin new
     episodes, which the log says.
     """
     plain = json.loads(str(state["plain"])) if "plain" in state else {}
     if plain.get("timesteps") != model.num_timesteps:
+        saved = plain.get("timesteps", "an unknown number of")
+        logger.warning(
+            f"the replay buffer was saved after {saved} steps, the agent after {model.num_timesteps}: learning goes on "
+            "with that buffer, but with new episodes and other random numbers than the saved run"
+        )
         return False
     _relive(collector, plain, state)
     for name, rng in generators(model).items():

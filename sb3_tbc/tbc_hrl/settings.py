@@ -59,6 +59,17 @@ def attribute_of(env: VecEnv, name: str) -> Any:
         return None
 
 
+def episode_length(env: VecEnv) -> int:
+    """Time limit of the task, environment steps.
+
+    :raises ValueError: if the environment has none
+    """
+    steps = attribute_of(env, "max_episode_steps") or getattr(attribute_of(env, "spec"), "max_episode_steps", None)
+    if steps is None:
+        raise ValueError("dt_max=-1 needs an environment with max_episode_steps; pass dt_max in steps")
+    return int(steps)
+
+
 def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str, ...] = ()) -> dict[str, Any]:
     """A level's settings with defaults filled in.
 

@@ -34,7 +34,14 @@ from sb3_tbc.tbc_hrl.policies import LevelPolicy
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY, Reachability
 from sb3_tbc.tbc_hrl.replay import Replay
 from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
-from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, attribute_of, check_settings, learning_rate_of, level_settings
+from sb3_tbc.tbc_hrl.settings import (
+    DEFAULT_WIRING,
+    attribute_of,
+    check_settings,
+    episode_length,
+    learning_rate_of,
+    level_settings,
+)
 from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
 
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
@@ -279,12 +286,7 @@ class TBCHRL(BaseAlgorithm):
         achieved_in_observation = attribute_of(env, "achieved_in_observation")
         self.achieved_in_observation = True if achieved_in_observation is None else bool(achieved_in_observation)
         if self.dt_max == -1:
-            steps = attribute_of(env, "max_episode_steps") or getattr(
-                attribute_of(env, "spec"), "max_episode_steps", None
-            )
-            if steps is None:
-                raise ValueError("dt_max=-1 needs an environment with max_episode_steps; pass dt_max in steps")
-            self.dt_max = steps / self.max_options
+            self.dt_max = episode_length(env) / self.max_options
 
     def _make_level(
         self, name: str, settings: dict[str, Any], observation: spaces.Box, action: spaces.Box, seed: int
@@ -297,13 +299,12 @@ class TBCHRL(BaseAlgorithm):
             policy_kwargs["ndbc"] = None if circuit is None else {**scale, **circuit}
             policy_kwargs.setdefault("negative_critic", self.low_reward == "step")
         gamma = settings["gamma"]
-        level = SACLevel(
+        return SACLevel(
             LevelPolicy, observation, action, None, learning_rate_of(settings["learning_rate"]), gamma, settings["tau"],
             settings["ent_coef"], settings["target_entropy"], policy_kwargs, seed=seed, device=self.device,
             compile=self.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"], name=name,
             label_coef=self.duration_loss_coef if name == "high" else 0.0,
         )  # fmt: skip
-        return level
 
     # ------------------------------------------------------------------ learning
 
@@ -328,15 +329,9 @@ class TBCHRL(BaseAlgorithm):
             self._updated_at = 0
         for level in (self.high, self.low):
             level.set_logger(self.logger)
+        explore = Exploration(self.random_fraction, self.testing_fraction, self.deterministic_testing, self.memory)
         self.collector = collector = Collector(
-            self.env,
-            self.high,
-            self.low,
-            self.layout,
-            self.rules,
-            self._exploration(),
-            self.rng,
-            self.schedule,
+            self.env, self.high, self.low, self.layout, self.rules, explore, self.rng, self.schedule
         )
         if resumed:
             resume.set_state(self, collector, resumed)
@@ -366,9 +361,6 @@ class TBCHRL(BaseAlgorithm):
             if self.verbose and level.compiled:
                 print(f"{name} level: update compiled in {seconds:.0f} s")
         self.start_time = time.time_ns()
-
-    def _exploration(self) -> Exploration:
-        return Exploration(self.random_fraction, self.testing_fraction, self.deterministic_testing, self.memory)
 
     def collect_rollouts(self, collector: Collector, callback: BaseCallback, total_timesteps: int) -> bool:
         """Act until an episode is over (or the steps are used up) and store it; False if a callback asks to stop."""
