@@ -216,4 +216,5 @@ def _local(observation: GoalObservation) -> FloatArray:
 def _subgoal(observation: GoalObservation) -> FloatArray:
     state = observation["observation"]
     angles, speeds = state[..., -6:-3], state[..., -3:]
-    return np.concatenate([np.fmod(angles, 2 * math.pi), np.clip(speeds, -MAX_SPEED, MAX_SPEED)], axis=-1)
+    bounded = np.minimum(np.maximum(speeds, -MAX_SPEED), MAX_SPEED)  # several times as fast as clip on so few
+    return np.concatenate([np.fmod(angles, 2 * math.pi), bounded], axis=-1)

@@ -11,7 +11,7 @@ import torch as th
 from sb3_tbc import benchmark_train
 from sb3_tbc.benchmark import benchmark
 from sb3_tbc.benchmark_floor import products
-from sb3_tbc.benchmark_profile import OUTSIDE, PARTS, Stopwatch, profile
+from sb3_tbc.benchmark_profile import OUTSIDE, PARTS, Stopwatch, profile, watching_cost
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.level import SACLevel
@@ -47,9 +47,24 @@ def test_stopwatch_charges_the_innermost(monkeypatch):
     watch = Stopwatch()
     watch.timed("outer", watch.timed("inner", lambda: None))()
     assert watch.seconds == {"outer": 4.0, "inner": 2.0}
+    assert watch.calls == {("outer", "inner"): 1}
 
 
-def test_profile_adds_up_and_leaves_no_trace():
+def test_watching_costs_microseconds():
+    caller, own = watching_cost(2000)
+    assert 0.0 < own < 1e-4
+    assert 0.0 <= caller < 1e-4
+
+
+def test_profile_takes_watching_off(monkeypatch):
+    model = benchmark_train.ours("Drawbridge", compile=False)
+    monkeypatch.setattr("sb3_tbc.benchmark_profile.watching_cost", lambda: (0.0, 1.0))  # a second a call
+    parts = profile(model, 100)
+    assert parts["environment"] == parts["acting"] == 0.0
+
+
+def test_profile_adds_up_and_leaves_no_trace(monkeypatch):
+    monkeypatch.setattr("sb3_tbc.benchmark_profile.watching_cost", lambda: (0.0, 0.0))  # is in what it took, too
     model = benchmark_train.ours("Drawbridge", compile=False)
     before = {owner: dict(vars(owner)) for owner in (Collector, SACLevel, TBCHRL)}
     start = time.process_time()
