@@ -185,6 +185,7 @@ class HindsightSettings(NamedTuple):
     testing_penalty: float  # reward of a testing transition, negative
     keep_original: bool  # also store failed options as they were chosen (paper, algorithm 1 line 26)
     tolerance: float | None = None  # relabelled options further than this from where they ended are not a success
+    goals_met: str = "passing"  # when a window meets its hindsight goal: "passing" it, or at its "end" alone
 
 
 def relabel_actions(
@@ -328,7 +329,8 @@ def high_level_steps(
     pairs = goal_pairs(n, settings.n_goals, settings.goal_strategy, rng, event)
     if len(pairs):
         goals = episode.achieved_goal[ends[pairs[:, 1]]]
-        copies = relabel_goals(episode, starts[pairs[:, 0]], durations[pairs[:, 0]], goals, reward, goal_test)
+        at_end = reward.target == "decision" or settings.goals_met == "end"
+        copies = relabel_goals(episode, starts[pairs[:, 0]], durations[pairs[:, 0]], goals, reward, goal_test, at_end)
         rows = pairs[:, 0]
         again = charged(copies.rewards, actions[rows]) + bonus[rows]
         parts.append(steps(rows, actions[rows], again, copies.dones, copies.durations, True, goals))
@@ -350,18 +352,20 @@ def relabel_goals(
     goals: FloatArray,
     reward: HighLevelReward,
     goal_test: GoalTest,
+    at_end: bool,
 ) -> RelabelledGoals:
     """Rewards of windows had their goals been ``goals`` (n, goal_dim).
 
-    With the SMDP target a window ends at the first step that meets the new goal, as the episode would have; HiTS's
-    target looks at the last step only.
+    :param at_end: look at the last step only, as HiTS does; else a window ends at the first step that meets the new
+        goal, as the episode would have. Where motion is erratic a goal is passed by chance, and the hindsight action,
+        the point where the window ended, would seldom pass it again
     """
     offsets = np.concatenate([[0], np.cumsum(durations)[:-1]])
     step = np.arange(int(durations.sum())) - np.repeat(offsets, durations) + np.repeat(starts, durations)
     achieved, wanted = episode.achieved_goal[step + 1], np.repeat(goals, durations, axis=0)
     step_rewards, met = goal_test.reward(achieved, wanted), goal_test.terminated(achieved, wanted)
     last = offsets + durations - 1
-    if reward.target == "decision":
+    if at_end:
         return RelabelledGoals(reward.of(step_rewards, offsets, durations), met[last], durations)
     met_before: NDArray[np.int64] = np.cumsum(met) - met
     over = met_before - np.repeat(met_before[offsets], durations) > 0

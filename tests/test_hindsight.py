@@ -92,14 +92,33 @@ def test_goal_pairs_never_use_an_options_own_outcome_nor_the_past() -> None:
 def test_relabelled_goal_met_inside_a_window_ends_it_there() -> None:
     reward = HighLevelReward("smdp", 1.0, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
     starts, durations = np.array([0, 0, 3]), np.array([3, 3, 2])
-    copies = relabel_goals(episode(), starts, durations, np.array([[0.2], [0.9], [0.5]]), reward, GOALS)
+    copies = relabel_goals(episode(), starts, durations, np.array([[0.2], [0.9], [0.5]]), reward, GOALS, at_end=False)
     np.testing.assert_array_equal(copies.dones, [True, False, True])
     np.testing.assert_array_equal(copies.durations, [2, 3, 2])
     np.testing.assert_allclose(copies.rewards, [-1 / 2 - 1, -3 / 2 - 1, -1 / 2 - 1])
     hits = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0)
-    at_the_end = relabel_goals(episode(), starts, durations, np.array([[0.2], [0.3], [0.5]]), hits, GOALS)
+    goals = np.array([[0.2], [0.3], [0.5]])
+    at_the_end = relabel_goals(episode(), starts, durations, goals, hits, GOALS, at_end=True)
     np.testing.assert_array_equal(at_the_end.dones, [False, True, True])
     np.testing.assert_array_equal(at_the_end.rewards, [-1, 0, 0])
+    at_the_end = relabel_goals(episode(), starts, durations, goals, reward, GOALS, at_end=True)
+    np.testing.assert_array_equal(at_the_end.dones, [False, True, True])
+    np.testing.assert_array_equal(at_the_end.durations, durations)
+    np.testing.assert_allclose(at_the_end.rewards, [-2 / 2 - 1, -2 / 2 - 1, -1 / 2 - 1])
+
+
+@pytest.mark.parametrize(("goals_met", "met"), [("passing", 1), ("end", 0)])
+def test_where_windows_meet_hindsight_goals_is_a_setting(goals_met: str, met: int) -> None:
+    there_and_on = np.array([0.0, 0.2, 0.5, 0.3, 0.4, 0.2])  # the second window ends where the first passed
+    rows = np.stack([there_and_on, np.arange(6.0), np.ones(6)], axis=1).astype(np.float32)
+    wandering = episode()._replace(observation=rows, achieved_goal=there_and_on[:, None], desired_goal=np.ones((6, 1)))
+    reward = HighLevelReward("smdp", 1.0, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
+    settings = HindsightSettings(1, "future", -5.0, keep_original=False, goals_met=goals_met)
+    steps = high_level_steps(
+        wandering, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0)
+    )
+    assert steps.dones[-1] == met
+    assert steps.durations[-1] == (1 if met else 3)
 
 
 def test_all_high_level_transitions_by_hand() -> None:

@@ -25,7 +25,11 @@ LEVEL_DEFAULTS: dict[str, Any] = {
 HIGH_DEFAULTS: dict[str, Any] = {"learning_rate": 3e-3, "ent_coef": 1.0}
 """Where the high level departs from them: a fixed temperature of the size of a decision's price keeps it exploring."""
 
-CHOICES = {"memory": ("window", "episode", "none"), "duration": ("joint", "rule", "fixed")}
+CHOICES = {
+    "memory": ("window", "episode", "none"),
+    "duration": ("joint", "rule", "fixed"),
+    "goals_met": ("passing", "end"),
+}
 
 DEFAULT_WIRING = {
     "inter": 8,

@@ -86,6 +86,8 @@ class TBCHRL(BaseAlgorithm):
     :param n_hindsight_goals: hindsight goals per transition
     :param goal_strategy: where the high level's hindsight goals come from: ``"future"`` or ``"episode"``, later or any
         options of the episode, or ``"event"``, the option that the task's event ended
+    :param goals_met: when a window meets a hindsight goal: ``"passing"`` it, as the episode would have ended, or at its
+        ``"end"`` alone, which HiTS's target always does
     :param gradient_ratio: updates of each level per environment step, done in bursts after episodes
     :param learning_starts: environment steps before the first update
     :param memory: when the membrane is reset: ``"window"``, ``"episode"`` or ``"none"`` (every step)
@@ -134,6 +136,7 @@ class TBCHRL(BaseAlgorithm):
         random_fraction: float = 0.05,
         n_hindsight_goals: float = 3,
         goal_strategy: str = "future",
+        goals_met: str = "passing",
         gradient_ratio: float = 1.0,
         learning_starts: int = 0,
         memory: str = "none",
@@ -174,7 +177,7 @@ class TBCHRL(BaseAlgorithm):
         self.testing_penalty, self.keep_original = testing_penalty, keep_original
         self.relabel_tolerance = relabel_tolerance
         self.random_fraction, self.n_hindsight_goals = random_fraction, n_hindsight_goals
-        self.goal_strategy = goal_strategy
+        self.goal_strategy, self.goals_met = goal_strategy, goals_met
         self.gradient_ratio, self.learning_starts = gradient_ratio, learning_starts
         self.memory, self.sequence_length, self.compile = memory, sequence_length, compile
         self.subgoals, self.relative_subgoals = subgoals, relative_subgoals
@@ -271,8 +274,9 @@ class TBCHRL(BaseAlgorithm):
     def _hindsight_settings(self) -> HindsightSettings:
         penalty = -float(self.max_options) if self.testing_penalty is None else self.testing_penalty
         return HindsightSettings(
-            int(self.n_hindsight_goals), self.goal_strategy, penalty, self.keep_original, self.relabel_tolerance
-        )
+            int(self.n_hindsight_goals), self.goal_strategy, penalty, self.keep_original, self.relabel_tolerance,
+            self.goals_met,
+        )  # fmt: skip
 
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""

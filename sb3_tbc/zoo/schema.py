@@ -96,6 +96,7 @@ MODEL: Schema = {
     "random_fraction": NUMBER,
     "n_hindsight_goals": NUMBER,
     "goal_strategy": frozenset({"future", "episode", "event"}),
+    "goals_met": frozenset({"passing", "end"}),
     "gradient_ratio": NUMBER,
     "learning_starts": int,
     "memory": frozenset({"window", "episode", "none"}),
