@@ -33,7 +33,7 @@ def build_parser() -> Parser:
     train.add_argument(
         "--config", choices=CONFIGS, help="which values of the tasks' settings; tuned where there are any"
     )
-    train.add_argument("--n-envs", type=positive_int, default=1, help="environments side by side, of split")
+    train.add_argument("--n-envs", type=positive_int, help="environments side by side, of split (the configuration's)")
     train.add_argument("--steps", type=positive_int, default=2000, help="environment steps of a stretch of learning")
     train.add_argument("--rounds", type=positive_int, default=5, help="stretches of each contender, in turns")
     train.add_argument("--json", metavar="OUT", help="write the figures here too")

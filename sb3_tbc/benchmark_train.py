@@ -62,11 +62,15 @@ def one_core() -> None:
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
-def ours(task: str, n_envs: int = 1, config: str | None = None, **settings: Any) -> TBCHRL:
-    """TBC-HRL as it is shipped for a task, compiled from the first update on where that is possible."""
+def ours(task: str, n_envs: int | None = 1, config: str | None = None, **settings: Any) -> TBCHRL:
+    """TBC-HRL as it is shipped for a task, compiled from the first update on where that is possible.
+
+    :param n_envs: environments side by side; None for the configuration's number
+    """
     task, env_id = resolve_env(task)
     run = load_config("tbc-hrl", task, config)
     model = {**run.model, "compile": compiler_problem() is None, **settings}
+    n_envs = run.n_envs if n_envs is None else n_envs
     run = RunConfig("tbc-hrl", task, run.config, run.n_timesteps, n_envs, run.env_kwargs, model)
     agent = build_model(run, make_envs(env_id, n_envs, 0, run.env_kwargs), 0)
     assert isinstance(agent, TBCHRL)
@@ -160,7 +164,7 @@ def speed(task: str, steps: int, rounds: int, config: str | None = None) -> Resu
     return lines, rows
 
 
-def split(task: str, steps: int, rounds: int, config: str | None = None, n_envs: int = 1) -> Result:
+def split(task: str, steps: int, rounds: int, config: str | None = None, n_envs: int | None = None) -> Result:
     """Microseconds of an environment step in each part; medians over the rounds."""
     model = ours(task, n_envs, config)
     warm_up(model, steps)
@@ -169,7 +173,7 @@ def split(task: str, steps: int, rounds: int, config: str | None = None, n_envs:
     share = statistics.median(sum(run[part] for part in OUTSIDE) / run["environment"] for run in runs)
     outside = sum(parts[part] for part in OUTSIDE)
     lines = [
-        f"| {task}, {n_envs} at once, microseconds per step | {' | '.join(PARTS)} |"
+        f"| {task}, {model.n_envs} at once, microseconds per step | {' | '.join(PARTS)} |"
         " all but environment, batches, updates |",
         "|---" * (len(PARTS) + 2) + "|",
         f"| | {' | '.join(f'{parts[p]:.1f}' for p in PARTS)} | {outside:.1f} = {share:.0%} of the environment's |",

@@ -75,6 +75,15 @@ def test_act_samples_the_squashed_gaussian(activation: type[nn.Module]) -> None:
     assert np.allclose(actions, (mean + log_std.exp() * th.from_numpy(noise)).tanh().detach().numpy(), atol=1e-6)
 
 
+def test_act_without_noise_where_a_mask_says_so() -> None:
+    level = make_level()
+    obs, states = inputs(level)
+    mask = np.array([True, False, True, False])
+    mixed, surely, sampled = (level.act(obs, states, d, np.random.default_rng(5))[0] for d in (mask, True, False))
+    np.testing.assert_array_equal(mixed, np.where(mask[:, None], surely, sampled))
+    assert not np.isclose(surely, sampled).any()
+
+
 def test_activation_without_numpy_form() -> None:
     with pytest.raises(ValueError, match="activation_fn must be one of"):
         make_level(policy_kwargs={"activation_fn": nn.Softplus})

@@ -69,6 +69,19 @@ def test_membrane_is_kept_as_long_as_memory_says(memory: str) -> None:
     np.testing.assert_array_equal(blank, expected)
 
 
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_tests_run_without_noise_if_asked(deterministic: bool) -> None:
+    model = make(
+        env=DummyVecEnv([Corridor, Corridor]), testing_fraction=1.0, deterministic_testing=deterministic,
+        random_fraction=0.5, gradient_ratio=0.0,
+    )  # fmt: skip
+    model.learn(20)
+    collector = model.collector
+    assert collector is not None
+    surely, _ = model.low.act(collector.observation, collector.membrane, True, np.random.default_rng(0))
+    assert np.array_equal(collector.act(), surely) == deterministic
+
+
 @pytest.mark.parametrize("task", ["Pendulum", "Drawbridge", "UR5Reacher"])
 def test_runs_on_tasks_by_id(task: str) -> None:
     model = make(env=f"sb3_tbc/{task}-v0", max_options=20, gradient_ratio=0.02)

@@ -131,22 +131,28 @@ class FrozenActor:
         )
 
     def act(
-        self, observations: FloatArray, states: FloatArray, deterministic: bool, rng: np.random.Generator
+        self,
+        observations: FloatArray,
+        states: FloatArray,
+        deterministic: bool | NDArray[np.bool_],
+        rng: np.random.Generator,
     ) -> tuple[FloatArray, FloatArray]:
         """Unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``.
 
         :param observations: ``(n, observation_dim)`` float32
         :param states: ``(n, state_dim)`` float32
-        :param deterministic: the squashed mean instead of a sample
+        :param deterministic: the squashed mean instead of a sample, for all rows or for those of a mask ``(n,)``
         :param rng: source of the noise
         """
         outputs, next_states = self._current()(observations, states)
         dim = self._dim
         bounded = np.minimum(np.maximum(outputs, self._lowest), self._highest)
         chosen = bounded[:, :dim]
-        if not deterministic:
+        if deterministic is not True:
             noise = np.exp(bounded[:, dim:])
             noise *= rng.standard_normal(chosen.shape, dtype=np.float32)
+            if deterministic is not False:
+                noise[deterministic] = 0.0
             noise += chosen
             chosen = noise
         return np.tanh(chosen, dtype=self._dtype).astype(np.float32, copy=False), next_states

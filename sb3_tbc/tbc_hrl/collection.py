@@ -117,19 +117,19 @@ class Collector:
 
     def act(self) -> FloatArray:
         """The exploring low level's unit actions for every environment."""
-        before, testing = self.membrane, self.env.clock.testing
-        unit, after = self.low.act(self.observation, before, False, self.rng)
-        self._randomise(unit)
-        if self.exploration.deterministic_testing and testing.any():
-            tested, _ = self.low.act(self.observation, before, True, self.rng)
-            unit = np.where(testing[:, None], tested, unit)
+        before = self.membrane
+        tested = self.env.clock.testing if self.exploration.deterministic_testing else False
+        unit, after = self.low.act(self.observation, before, tested, self.rng)
+        self._randomise(unit, tested)
         self.env.remember(before, after)
         self.membrane = after
         return unit
 
-    def _randomise(self, unit: FloatArray) -> None:
-        """Replace a share of the actions by uniform ones, in place."""
+    def _randomise(self, unit: FloatArray, spared: bool | NDArray[np.bool_] = False) -> None:
+        """Replace a share of the actions by uniform ones, in place; not those of a mask ``(n,)``."""
         uniform = self.rng.random(len(unit)) < self.exploration.random_fraction
+        if spared is not False:
+            uniform &= np.logical_not(spared)
         if np.count_nonzero(uniform):
             unit[uniform] = self.rng.uniform(-1.0, 1.0, (int(uniform.sum()), unit.shape[1]))
 

@@ -259,7 +259,7 @@ class SACLevel(SAC):
         self,
         observations: FloatArray,
         states: FloatArray,
-        deterministic: bool,
+        deterministic: bool | NDArray[np.bool_],
         rng: np.random.Generator,
         average: bool = False,
     ) -> tuple[FloatArray, FloatArray]:
@@ -267,7 +267,7 @@ class SACLevel(SAC):
 
         :param observations: ``(n, observation_dim)`` float32
         :param states: ``(n, state_dim)`` float32, zeros at the start of a window
-        :param deterministic: the squashed mean instead of a sample
+        :param deterministic: the squashed mean instead of a sample, for all rows or for those of a mask ``(n,)``
         :param rng: source of the noise
         :param average: act from the averaged actor
         :return: unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``
