@@ -9,6 +9,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.save_util import load_from_zip_file
+from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
 from sb3_tbc.errors import HierarchyError, NonFiniteError
@@ -189,6 +190,20 @@ def test_what_is_compiled_is_not_pickled() -> None:
     level.train(1, 16)
     level._update._steps[16, 0] = lambda *args: None
     assert pickle.loads(pickle.dumps(level._update.__getstate__()["_steps"])) == {}
+
+
+def test_the_actor_has_a_learning_rate_of_its_own() -> None:
+    level = make_level(NDBC, actor_learning_rate=0.0)
+    actor, critic = (copy.deepcopy(part.state_dict()) for part in (level.policy.actor, level.policy.critic))
+    level.train(2, 16)
+    assert all(th.equal(value, actor[name]) for name, value in level.policy.actor.state_dict().items())
+    assert any(not th.equal(value, critic[name]) for name, value in level.policy.critic.state_dict().items())
+    assert level.logger.name_to_value["low/actor_learning_rate"] == 0.0
+    falling = make_level(actor_learning_rate=LinearSchedule(0.5, 0.0, 1.0))
+    falling._current_progress_remaining = 0.5
+    falling.train(1, 16)
+    assert falling.policy.actor.optimizer.param_groups[0]["lr"] == pytest.approx(0.25)
+    assert falling.policy.critic.optimizer.param_groups[0]["lr"] == 1e-2
 
 
 def test_policy_can_be_copied() -> None:

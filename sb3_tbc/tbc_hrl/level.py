@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
@@ -90,6 +91,7 @@ class SACLevel(SAC):
     :param action_space: the level's actions, unit coordinates
     :param replay_buffer: gives :class:`LevelBatch` bursts; may be set later
     :param ent_coef_learning_rate: of the automatic temperature, by default the schedule ``learning_rate``
+    :param actor_learning_rate: of the actor, by default ``learning_rate``; circuits take larger steps than critics
     :param compile: "auto" (compiled if there is a C++ compiler), True or False (eager)
     :param name: names the level in messages and logs (``low/critic_loss``)
     :param label_coef: weight of a regression of the last action coordinate toward labels of the replay buffer in the
@@ -116,6 +118,7 @@ class SACLevel(SAC):
         device: th.device | str = "cpu",
         compile: bool | str = "auto",
         ent_coef_learning_rate: float | None = None,
+        actor_learning_rate: float | Schedule | None = None,
         name: str = "level",
         label_coef: float = 0.0,
     ) -> None:
@@ -135,6 +138,7 @@ class SACLevel(SAC):
         )
         self.compile = compile
         self.ent_coef_learning_rate = ent_coef_learning_rate
+        self.actor_lr_schedule = None if actor_learning_rate is None else FloatSchedule(actor_learning_rate)
         self.log_prefix = f"{name}/"
         self.label_coef = label_coef
         self.set_logger(Logger(folder=None, output_formats=[]))
@@ -226,6 +230,10 @@ class SACLevel(SAC):
         learning_rate = self.lr_schedule(self._current_progress_remaining)
         for optimizer in self._update.optimizers():
             optimizer.param_groups[0]["lr"] = learning_rate
+        if self.actor_lr_schedule is not None:
+            actor_learning_rate = self.actor_lr_schedule(self._current_progress_remaining)
+            self.policy.actor.optimizer.param_groups[0]["lr"] = actor_learning_rate
+            self.logger.record(self.log_prefix + "actor_learning_rate", actor_learning_rate)
         if self.ent_coef_optimizer is not None and self.ent_coef_learning_rate is not None:
             self.ent_coef_optimizer.param_groups[0]["lr"] = self.ent_coef_learning_rate
         self.logger.record(self.log_prefix + "learning_rate", learning_rate)

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 LEVEL_DEFAULTS: dict[str, Any] = {
     "learning_rate": 2e-3,
+    "actor_learning_rate": None,
     "ent_coef_learning_rate": None,
     "batch_size": 256,
     "gamma": 0.99,

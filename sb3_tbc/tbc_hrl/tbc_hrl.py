@@ -57,7 +57,8 @@ class TBCHRL(BaseAlgorithm):
     :param policy: ``"MultiInputPolicy"``
     :param env: a goal environment or its id; its ``subgoals`` attribute says what the high level may ask for
     :param high: settings of the high level under SB3's names (``learning_rate, batch_size, gamma, tau, ent_coef,
-        target_entropy, ent_coef_learning_rate, buffer_size, policy_kwargs``); ``gamma`` is per decision
+        target_entropy, buffer_size, policy_kwargs``; also ``actor_learning_rate`` and ``ent_coef_learning_rate`` where
+        they differ); ``gamma`` is per decision
     :param low: settings of the low level, likewise; ``policy_kwargs["ndbc"]`` holds the circuit's wiring, None for an
         MLP actor; ``n_hindsight_goals`` and ``goal_strategy`` may differ from the high level's
     :param max_options: high-level decisions allowed per episode
@@ -302,11 +303,12 @@ class TBCHRL(BaseAlgorithm):
             scale = {"input_scale": self.layout.low_scale().tolist()}
             policy_kwargs["ndbc"] = None if circuit is None else {**scale, **circuit}
             policy_kwargs.setdefault("negative_critic", self.low_reward == "step")
-        gamma = settings["gamma"]
+        gamma, actor_rate = settings["gamma"], settings["actor_learning_rate"]
         return SACLevel(
             LevelPolicy, observation, action, None, learning_rate_of(settings["learning_rate"]), gamma, settings["tau"],
             settings["ent_coef"], settings["target_entropy"], policy_kwargs, seed=seed, device=self.device,
-            compile=self.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"], name=name,
+            compile=self.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"],
+            actor_learning_rate=None if actor_rate is None else learning_rate_of(actor_rate), name=name,
             label_coef=self.duration_loss_coef if name == "high" else 0.0,
         )  # fmt: skip
 

@@ -48,6 +48,7 @@ POLICY: Schema = {
 }
 LEVEL: Schema = {
     "learning_rate": (int, float, str),
+    "actor_learning_rate": (int, float, str),
     "ent_coef_learning_rate": NUMBER,
     "batch_size": int,
     "gamma": NUMBER,
