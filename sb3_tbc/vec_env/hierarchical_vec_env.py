@@ -169,14 +169,9 @@ class HierarchicalVecEnv(VecEnvWrapper):
             ended |= self.layout.subgoals.happened(seen)
         if self.rules.window_end == "timed":
             return None, ended
-        reached = self._reached(seen, self._everywhere)
+        reached = self.layout.subgoals.reached(self.layout.subgoals.achieved(seen), self.clock.subgoal)
         early = reached & (self.clock.elapsed >= self.rules.dt_min)
         return reached, ended | early
-
-    def _reached(self, seen: GoalObservation, where: NDArray[np.intp]) -> NDArray[np.bool_]:
-        subgoals = self.layout.subgoals
-        achieved = subgoals.achieved({key: seen[key][where] for key in GOAL_KEYS})
-        return subgoals.reached(achieved, self.clock.subgoal[where])
 
     def _close_options(
         self,
@@ -187,8 +182,12 @@ class HierarchicalVecEnv(VecEnvWrapper):
         infos: list[dict[str, Any]],
     ) -> FloatArray:
         """Record the options that end; the low level's reward of each."""
-        reached_here = self._reached(seen, where) if reached is None else reached[where]
-        event = self.layout.subgoals.happened({key: seen[key][where] for key in GOAL_KEYS})
+        subgoals, here = self.layout.subgoals, {key: seen[key][where] for key in GOAL_KEYS}
+        if reached is None:
+            reached_here = subgoals.reached(subgoals.achieved(here), self.clock.subgoal[where])
+        else:
+            reached_here = reached[where]
+        event = subgoals.happened(here)
         rewards = np.zeros(len(where), dtype=np.float32)
         for row, index in enumerate(where):
             step = int(self._recorder.steps[index])
