@@ -89,9 +89,11 @@ class RingBuffer(BaseBuffer):
             raise ValueError(
                 f"an episode of {count} rows does not fit a buffer of {self.buffer_size}; raise buffer_size"
             )
-        at = (self.pos + np.arange(count)) % self.buffer_size
-        for name, array in self.data.items():
-            array[at] = np.asarray(rows[name], dtype=np.float32).reshape(count, array.shape[1])
+        parts = [np.asarray(rows[name]).reshape(count, c.stop - c.start) for name, c in self._columns.items()]
+        block = np.concatenate(parts, axis=1, dtype=np.float32)
+        first = min(count, self.buffer_size - self.pos)  # rows before the ring's end
+        self._table[self.pos : self.pos + first] = block[:first]
+        self._table[: count - first] = block[first:]
         self.full = self.full or self.pos + count >= self.buffer_size
         self.pos = (self.pos + count) % self.buffer_size
 

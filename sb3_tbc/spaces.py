@@ -110,7 +110,8 @@ class SubgoalSpace:
         """Whether ``achieved`` lies within the thresholds of ``subgoal`` (strictly, as in HiTS), ``(...)``."""
         difference = achieved - subgoal
         if len(self.groups) == self.dim:
-            return np.asarray((np.abs(difference) < self.thresholds).all(axis=-1))
+            near = np.abs(difference, out=difference) < self.thresholds
+            return np.asarray(np.logical_and.reduce(near, axis=-1))  # all(), without its detour through Python
         distances = np.stack([np.linalg.norm(difference[..., list(g)], axis=-1) for g in self.groups], axis=-1)
         return np.asarray((distances < self.thresholds).all(axis=-1))
 

@@ -128,10 +128,11 @@ class Collector:
     def _randomise(self, unit: FloatArray, spared: bool | NDArray[np.bool_] = False) -> None:
         """Replace a share of the actions by uniform ones, in place; not those of a mask ``(n,)``."""
         uniform = self.rng.random(len(unit)) < self.exploration.random_fraction
+        if not np.count_nonzero(uniform):
+            return
         if spared is not False:
             uniform &= np.logical_not(spared)
-        if np.count_nonzero(uniform):
-            unit[uniform] = self.rng.uniform(-1.0, 1.0, (int(uniform.sum()), unit.shape[1]))
+        unit[uniform] = self.rng.uniform(-1.0, 1.0, (np.count_nonzero(uniform), unit.shape[1]))
 
 
 class EpisodeStore:
