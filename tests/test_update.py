@@ -156,17 +156,18 @@ def test_squash_log_prob_is_the_density_of_the_action() -> None:
     assert th.allclose(log_prob[inner], exact.log_prob(actions)[inner], atol=1e-4)
 
 
-def test_average_actor_follows_the_actor() -> None:
-    level = make_level(make_batches(), policy_kwargs={"net_arch": [8]})
+@pytest.mark.parametrize("longest", [0.999, 0.3, 0.0])
+def test_average_actor_follows_the_actor(longest: float) -> None:
+    level = make_level(make_batches(), policy_kwargs={"net_arch": [8]}, average_decay=longest)
     actors = [level._update.actor.vector.detach().clone()]
     expected = actors[0].clone()
     for n in range(1, 6):
         level.train(1, BATCH)
-        decay = min(0.999, (1 + n) / (10 + n))
+        decay = min(longest, (1 + n) / (10 + n))
         expected = decay * expected + (1 - decay) * level._update.actor.vector.detach()
     average = th.cat([b.flatten() for b in level._update.average.unflatten(level._update.average.vector)])
     assert th.allclose(average, expected, atol=1e-6)
-    assert not th.allclose(average, level._update.actor.vector)
+    assert th.allclose(average, level._update.actor.vector) == (longest == 0.0)
 
 
 def test_modules_share_the_flat_storage() -> None:

@@ -20,7 +20,7 @@ from torch import nn
 from sb3_tbc.errors import HierarchyError, NonFiniteError
 from sb3_tbc.tbc_hrl.acting import FrozenActor
 from sb3_tbc.tbc_hrl.policies import LevelPolicy
-from sb3_tbc.tbc_hrl.update import SACUpdate
+from sb3_tbc.tbc_hrl.update import AVERAGE_DECAY, SACUpdate
 from sb3_tbc.type_aliases import LevelBatch
 
 FloatArray = NDArray[np.floating[Any]]
@@ -96,6 +96,7 @@ class SACLevel(SAC):
     :param name: names the level in messages and logs (``low/critic_loss``)
     :param label_coef: weight of a regression of the last action coordinate toward labels of the replay buffer in the
         actor's loss (the paper's duration loss); if positive, batches come from ``replay_buffer.sample_labelled``
+    :param average_decay: decay per update of the averaged actor, which acts where deterministic actions are asked for
 
     Other parameters are SB3's; ``policy_kwargs`` are :class:`LevelPolicy`'s.
     """
@@ -121,6 +122,7 @@ class SACLevel(SAC):
         actor_learning_rate: float | Schedule | None = None,
         name: str = "level",
         label_coef: float = 0.0,
+        average_decay: float = AVERAGE_DECAY,
     ) -> None:
         super().__init__(
             LevelPolicy if isinstance(policy, str) else policy,
@@ -140,7 +142,7 @@ class SACLevel(SAC):
         self.ent_coef_learning_rate = ent_coef_learning_rate
         self.actor_lr_schedule = None if actor_learning_rate is None else FloatSchedule(actor_learning_rate)
         self.log_prefix = f"{name}/"
-        self.label_coef = label_coef
+        self.label_coef, self.average_decay = label_coef, average_decay
         self.set_logger(Logger(folder=None, output_formats=[]))
         self._setup_model()
         self.replay_buffer = replay_buffer  # type: ignore[assignment]
@@ -151,7 +153,9 @@ class SACLevel(SAC):
             zeros = {"exp_avg": th.zeros(1), "exp_avg_sq": th.zeros(1)}
             self.ent_coef_optimizer.state[self.log_ent_coef] = {"step": th.tensor(0.0), **zeros}
         self.noise_rng = np.random.default_rng(self.seed)
-        self._update = SACUpdate(self.policy, self.ent_coef_optimizer, self.compile, self.label_coef)
+        self._update = SACUpdate(
+            self.policy, self.ent_coef_optimizer, self.compile, self.label_coef, self.average_decay
+        )
         self._frozen = {average: FrozenActor(self.policy, average) for average in (False, True)}
 
     def _excluded_save_params(self) -> list[str]:

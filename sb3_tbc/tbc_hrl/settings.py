@@ -9,10 +9,13 @@ from typing import Any
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.tbc_hrl.update import AVERAGE_DECAY
+
 LEVEL_DEFAULTS: dict[str, Any] = {
     "learning_rate": 2e-3,
     "actor_learning_rate": None,
     "ent_coef_learning_rate": None,
+    "average_decay": AVERAGE_DECAY,
     "batch_size": 256,
     "gamma": 0.99,
     "tau": 0.0125,
@@ -87,6 +90,9 @@ def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str,
             near = difflib.get_close_matches(key, allowed, n=1)
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"unknown setting {name}.{key}{hint} Allowed: {', '.join(sorted(allowed))}")
+    decay = given.get("average_decay", AVERAGE_DECAY)
+    if not 0.0 <= decay < 1.0:
+        raise ValueError(f"{name}.average_decay must be at least 0 (no averaging) and less than 1, got {decay}")
     kwargs = {**LEVEL_DEFAULTS["policy_kwargs"], **given.get("policy_kwargs", {})}
     if name == "high":
         kwargs.setdefault("negative_critic", True)

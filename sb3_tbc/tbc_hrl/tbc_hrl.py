@@ -58,7 +58,7 @@ class TBCHRL(BaseAlgorithm):
     :param env: a goal environment or its id; its ``subgoals`` attribute says what the high level may ask for
     :param high: settings of the high level under SB3's names (``learning_rate, batch_size, gamma, tau, ent_coef,
         target_entropy, buffer_size, policy_kwargs``; also ``actor_learning_rate`` and ``ent_coef_learning_rate`` where
-        they differ); ``gamma`` is per decision
+        they differ, and ``average_decay`` of the averaged actor); ``gamma`` is per decision
     :param low: settings of the low level, likewise; ``policy_kwargs["ndbc"]`` holds the circuit's wiring, None for an
         MLP actor; ``n_hindsight_goals`` and ``goal_strategy`` may differ from the high level's
     :param max_options: high-level decisions allowed per episode
@@ -309,7 +309,7 @@ class TBCHRL(BaseAlgorithm):
             settings["ent_coef"], settings["target_entropy"], policy_kwargs, seed=seed, device=self.device,
             compile=self.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"],
             actor_learning_rate=None if actor_rate is None else learning_rate_of(actor_rate), name=name,
-            label_coef=self.duration_loss_coef if name == "high" else 0.0,
+            label_coef=self.duration_loss_coef if name == "high" else 0.0, average_decay=settings["average_decay"],
         )  # fmt: skip
 
     # ------------------------------------------------------------------ learning

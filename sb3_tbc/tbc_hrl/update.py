@@ -27,7 +27,7 @@ from sb3_tbc.type_aliases import LevelBatch
 
 DIAGNOSTICS = ("critic_loss", "actor_loss", "ent_coef_loss", "ent_coef", "q_mean", "entropy")
 AVERAGE_DECAY = 0.999
-"""Decay per update of the averaged actor; during the first updates (1 + n) / (10 + n) where that is smaller."""
+"""Decay per update of the averaged actor unless given; during the first updates (1 + n) / (10 + n) if smaller."""
 SQUASH_EPSILON = 1e-6
 """Added inside the logarithm of tanh's derivative, as SB3 does."""
 HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
@@ -138,6 +138,7 @@ class SACUpdate:
     :param ent_coef_optimizer: optimizer of the logarithm of the temperature, None for a fixed temperature
     :param compile: "auto" (compiled if there is a C++ compiler), True or False
     :param label_coef: weight of the squared distance between the actor's last action coordinate and given labels
+    :param average_decay: decay per update of the averaged actor
     """
 
     def __init__(
@@ -146,6 +147,7 @@ class SACUpdate:
         ent_coef_optimizer: th.optim.Adam | None = None,
         compile: bool | str = "auto",
         label_coef: float = 0.0,
+        average_decay: float = AVERAGE_DECAY,
     ) -> None:
         self.policy = policy
         self.actor = FlatParameters(policy.actor.blocks())
@@ -157,7 +159,7 @@ class SACUpdate:
         self.ent_coef_optimizer = ent_coef_optimizer
         self.action_dim = math.prod(policy.action_space.shape or (1,))
         self.compile = compile
-        self.label_coef = label_coef
+        self.label_coef, self.average_decay = label_coef, average_decay
         self._steps: dict[tuple[int, int], Callable[..., None]] = {}
 
     def __getstate__(self) -> dict[str, Any]:
@@ -266,7 +268,7 @@ class SACUpdate:
             table[:, column] = option["lr"] / (1 - option["betas"][0] ** count)
         table[:, 3] = 1 / np.sqrt(1 - options[0]["betas"][1] ** count)
         table[:, 4] = tau
-        table[:, 5] = 1 - np.minimum(AVERAGE_DECAY, (1 + count) / (10 + count))
+        table[:, 5] = 1 - np.minimum(self.average_decay, (1 + count) / (10 + count))
         table[:, 6] = target_entropy
         return th.from_numpy(table)
 

@@ -50,6 +50,7 @@ LEVEL: Schema = {
     "learning_rate": (int, float, str),
     "actor_learning_rate": (int, float, str),
     "ent_coef_learning_rate": NUMBER,
+    "average_decay": NUMBER,
     "batch_size": int,
     "gamma": NUMBER,
     "tau": NUMBER,
