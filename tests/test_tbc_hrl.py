@@ -255,7 +255,7 @@ def test_user_mistakes_are_named() -> None:
         make(env=gym.make("MountainCarContinuous-v0"))
     with pytest.raises(ValueError, match="learning_rate"):
         make(low={"learning_rat": 1.0})
-    with pytest.raises(ValueError, match="low.average_decay must be .* got 1.0"):
+    with pytest.raises(ValueError, match=r"low.average_decay must be .* got 1.0"):
         make(low={"average_decay": 1.0})
     with pytest.raises(ValueError, match="memory"):
         make(memory="forever")
