@@ -290,6 +290,27 @@ def test_learns_the_corridor() -> None:
     assert evaluate_hierarchical(model, Corridor(), 40, seed=1).success_rate >= 0.9
 
 
+def test_agents_saved_before_a_setting_existed_load(tmp_path: Path) -> None:
+    model = make()
+    for settings in (model.high_settings, model.low_settings):
+        for name in ("average_decay", "gradient_ratio", "actor_learning_rate"):
+            del settings[name]
+    model.save(tmp_path / "old")
+    loaded = type(model).load(tmp_path / "old")
+    assert loaded.low_settings["average_decay"] == loaded.low.average_decay == 0.999
+    assert loaded.high_settings["gradient_ratio"] is None
+
+
+def test_a_level_may_have_a_gradient_ratio_of_its_own() -> None:
+    model = make(gradient_ratio=0.5, high={"gradient_ratio": 0.1, "batch_size": 4}, low={"batch_size": 16})
+    model.learn(1000)
+    steps = model.num_timesteps
+    assert 0.3 * steps < model.low._n_updates <= 0.5 * steps
+    assert 0.04 * steps < model.high._n_updates <= 0.1 * steps
+    with pytest.raises(ValueError, match=r"high.gradient_ratio must not be negative, got -1"):
+        make(high={"gradient_ratio": -1})
+
+
 def test_learning_rate_may_fall_linearly_and_is_saved_as_text(tmp_path: Path) -> None:
     model = make(low={**LEVEL, "learning_rate": "lin_1e-3"})
     model.learn(200)

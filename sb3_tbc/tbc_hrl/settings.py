@@ -17,6 +17,7 @@ LEVEL_DEFAULTS: dict[str, Any] = {
     "ent_coef_learning_rate": None,
     "average_decay": AVERAGE_DECAY,
     "batch_size": 256,
+    "gradient_ratio": None,
     "gamma": 0.99,
     "tau": 0.0125,
     "ent_coef": "auto",
@@ -91,6 +92,8 @@ def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str,
             hint = f"; did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"unknown setting {name}.{key}{hint} Allowed: {', '.join(sorted(allowed))}")
     decay = given.get("average_decay", AVERAGE_DECAY)
+    if (given.get("gradient_ratio") or 0) < 0:
+        raise ValueError(f"{name}.gradient_ratio must not be negative, got {given['gradient_ratio']}")
     if not 0.0 <= decay < 1.0:
         raise ValueError(f"{name}.average_decay must be at least 0 (no averaging) and less than 1, got {decay}")
     kwargs = {**LEVEL_DEFAULTS["policy_kwargs"], **given.get("policy_kwargs", {})}

@@ -36,6 +36,7 @@ from sb3_tbc.tbc_hrl.replay import Replay
 from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
 from sb3_tbc.tbc_hrl.settings import (
     DEFAULT_WIRING,
+    LEVEL_DEFAULTS,
     attribute_of,
     check_settings,
     episode_length,
@@ -58,7 +59,8 @@ class TBCHRL(BaseAlgorithm):
     :param env: a goal environment or its id; its ``subgoals`` attribute says what the high level may ask for
     :param high: settings of the high level under SB3's names (``learning_rate, batch_size, gamma, tau, ent_coef,
         target_entropy, buffer_size, policy_kwargs``; also ``actor_learning_rate`` and ``ent_coef_learning_rate`` where
-        they differ, and ``average_decay`` of the averaged actor); ``gamma`` is per decision
+        they differ, ``gradient_ratio`` where it is not the agent's, and ``average_decay`` of the averaged actor);
+        ``gamma`` is per decision
     :param low: settings of the low level, likewise; ``policy_kwargs["ndbc"]`` holds the circuit's wiring, None for an
         MLP actor; ``n_hindsight_goals`` and ``goal_strategy`` may differ from the high level's
     :param max_options: high-level decisions allowed per episode
@@ -207,6 +209,10 @@ class TBCHRL(BaseAlgorithm):
         self.rng = np.random.default_rng(seeds[0])
         high_spaces = self.layout.high_space(space), self.layout.high_action_space()
         low_spaces = self.layout.low_space(), spaces.Box(-1.0, 1.0, actions.shape, np.float32)
+        # agents that were saved before a setting existed
+        self.high_settings, self.low_settings = (
+            {**LEVEL_DEFAULTS, **s} for s in (self.high_settings, self.low_settings)
+        )
         self.high = self._make_level("high", self.high_settings, *high_spaces, seed=seeds[1])
         self.low = self._make_level("low", self.low_settings, *low_spaces, seed=seeds[2])
         self._set_schedule(self.subgoals, seeds[6])
@@ -391,15 +397,16 @@ class TBCHRL(BaseAlgorithm):
         """Update both levels as often as ``gradient_ratio`` and the steps since the last time say."""
         steps = self.num_timesteps - self._updated_at
         self._updated_at = self.num_timesteps
-        updates = int(self.gradient_ratio * steps)
-        if self.num_timesteps <= self.learning_starts or updates < 1:
+        if self.num_timesteps <= self.learning_starts:
             return
         levels = zip((self.high, self.low), self.replay_buffer, (self.high_settings, self.low_settings), strict=True)
         for level, buffer, settings in levels:
-            if buffer.size() >= settings["batch_size"]:
+            ratio = self.gradient_ratio if settings["gradient_ratio"] is None else settings["gradient_ratio"]
+            updates = int(ratio * steps)
+            if updates and buffer.size() >= settings["batch_size"]:
                 level._current_progress_remaining = self._current_progress_remaining
                 level.train(updates, settings["batch_size"])
-        self._n_updates += updates
+        self._n_updates += int(self.gradient_ratio * steps)
         if self.reachability is not None:
             loss = self.reachability.train_on(self.replay_buffer.low, max(steps // UPDATE_EVERY, 1))
             self.logger.record("reachability/loss", loss)

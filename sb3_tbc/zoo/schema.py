@@ -52,6 +52,7 @@ LEVEL: Schema = {
     "ent_coef_learning_rate": NUMBER,
     "average_decay": NUMBER,
     "batch_size": int,
+    "gradient_ratio": NUMBER,
     "gamma": NUMBER,
     "tau": NUMBER,
     "ent_coef": (int, float, str),
