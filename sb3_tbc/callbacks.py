@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import os
 import time
 from collections.abc import Callable, Iterable
@@ -181,9 +182,10 @@ class SuccessEvalCallback(EventCallback):
         if is_best and self.callback_on_new_best is not None:
             self.callback_on_new_best.on_step()
         if self.verbose:
+            options = f", subgoals reached {row.subgoal_success:.2f}, window {row.mean_window:.1f} steps"
             print(
-                f"{row.timesteps:>9,} steps: success {row.success_rate:.2f}, length {row.mean_length:.0f}, "
-                f"subgoals reached {row.subgoal_success:.2f}, window {row.mean_window:.1f} steps"
+                f"{row.timesteps:>9,} steps: success {row.success_rate:.2f}, length {row.mean_length:.0f}"
+                f"{'' if math.isnan(row.mean_window) else options}"  # a flat agent has no options
             )
 
 

@@ -294,6 +294,9 @@ def test_baselines_go_through_the_same_doors(algo: str, tmp_path: Path, capsys: 
     small = TINY if algo == "hac" else ["--hyperparams", "gradient_ratio:0.02", "batch_size:16", "buffer_size:1000"]
     arguments = ["--algo", algo, "--env", "Drawbridge", "--log-folder", str(tmp_path), "--n-timesteps", "300"]
     assert train.main([*arguments, "--keep-checkpoint", *SHORT, *small]) == 0
+    printed = capsys.readouterr().out
+    assert ("subgoals reached" in printed) == (algo == "hac")
+    assert "nan" not in printed
     folder = RunFolder.of(tmp_path, "Drawbridge", algo, "full", 0)
     final = folder.read_final()
     assert final["algo"] == algo
