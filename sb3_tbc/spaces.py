@@ -93,10 +93,15 @@ class SubgoalSpace:
         Neurons of moderate gain must tell a subgoal from its neighbours; scaled by its bounds alone, a threshold of
         4 % of the range moves them too little.
         """
+        return np.minimum(self.tolerance / 0.15, np.maximum(np.abs(self.low), np.abs(self.high)))
+
+    @property
+    def tolerance(self) -> FloatArray:
+        """The threshold that each coordinate belongs to, ``(subgoal_dim,)``, task units."""
         per_coordinate = np.empty(self.dim)
         for group, threshold in zip(self.groups, self.thresholds, strict=True):
             per_coordinate[list(group)] = threshold
-        return np.minimum(per_coordinate / 0.15, np.maximum(np.abs(self.low), np.abs(self.high)))
+        return per_coordinate
 
     def achieved(self, observation: GoalObservation) -> FloatArray:
         """Subgoal-space point of a goal observation, ``(..., subgoal_dim)``, task units."""

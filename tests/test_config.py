@@ -204,7 +204,7 @@ def test_the_schema_is_what_the_agent_takes() -> None:
     taken = set(inspect.signature(TBCHRL).parameters)
     given_by_the_runner = {"env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size"}
     assert set(MODEL) == taken - given_by_the_runner - {"subgoals", "_init_setup_model"}
-    assert set(LEVEL) == {*LEVEL_DEFAULTS, "n_hindsight_goals", "goal_strategy"}
+    assert set(LEVEL) == {*LEVEL_DEFAULTS, "n_hindsight_goals", "goal_strategy", "near_misses"}
 
 
 @pytest.mark.parametrize("config", ["paper", "tuned"])

@@ -167,6 +167,21 @@ def test_relabelled_low_level_samples_are_consistent() -> None:
     np.testing.assert_array_equal(batch.dones[0, :, 0].numpy(), rewards)
 
 
+def test_near_misses_are_judged_by_the_subgoals_own_test() -> None:
+    buffer = low_buffer(100, hindsight=1e9, near_misses=0.8)
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    batch = buffer.sample_burst(1, 8000)
+    after, subgoal = batch.next_observations[0, :, 0].numpy(), batch.observations[0, :, 3].numpy()
+    rewards, over = batch.rewards[0, :, 0].numpy() > 0, batch.dones[0, :, 0].numpy() > 0
+    expired = batch.next_observations[0, :, 4].numpy() == 0  # no time left after the step
+    np.testing.assert_array_equal(over, expired)
+    np.testing.assert_array_equal(rewards, expired & (np.abs(after - subgoal) < ENV.subgoals.thresholds[0]))
+    hits = rewards[expired].mean()
+    assert hits == pytest.approx(0.2 + 0.8 * 0.847, abs=0.03)  # a normal distribution within 1 / 0.7 deviations
+    moved = np.abs(np.rint(subgoal / 0.1) * 0.1 - subgoal) > 1e-5
+    assert moved.mean() == pytest.approx(0.8, abs=0.03)
+
+
 def test_plain_low_level_samples_are_what_was_stored() -> None:
     buffer = low_buffer(100, hindsight=0)
     buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))

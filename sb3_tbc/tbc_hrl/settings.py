@@ -94,6 +94,8 @@ def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str,
     decay = given.get("average_decay", AVERAGE_DECAY)
     if (given.get("gradient_ratio") or 0) < 0:
         raise ValueError(f"{name}.gradient_ratio must not be negative, got {given['gradient_ratio']}")
+    if not 0.0 <= given.get("near_misses", 0.0) <= 1.0:
+        raise ValueError(f"{name}.near_misses is a share and must lie in [0, 1], got {given['near_misses']}")
     if not 0.0 <= decay < 1.0:
         raise ValueError(f"{name}.average_decay must be at least 0 (no averaging) and less than 1, got {decay}")
     kwargs = {**LEVEL_DEFAULTS["policy_kwargs"], **given.get("policy_kwargs", {})}

@@ -62,7 +62,8 @@ class TBCHRL(BaseAlgorithm):
         they differ, ``gradient_ratio`` where it is not the agent's, and ``average_decay`` of the averaged actor);
         ``gamma`` is per decision
     :param low: settings of the low level, likewise; ``policy_kwargs["ndbc"]`` holds the circuit's wiring, None for an
-        MLP actor; ``n_hindsight_goals`` and ``goal_strategy`` may differ from the high level's
+        MLP actor; ``n_hindsight_goals`` and ``goal_strategy`` may differ from the high level's; ``near_misses`` is the
+        share of hindsight subgoals moved off the point reached, see :class:`~sb3_tbc.buffers.SubgoalReplayBuffer`
     :param max_options: high-level decisions allowed per episode
     :param window_end: ``"timed"`` or ``"reached"``, see :class:`~sb3_tbc.options.OptionRules`
     :param dt_min: shortest time budget, environment steps
@@ -166,7 +167,7 @@ class TBCHRL(BaseAlgorithm):
             seed=seed,
         )
         self.high_settings = level_settings("high", high)
-        self.low_settings = level_settings("low", low, extra=("n_hindsight_goals", "goal_strategy"))
+        self.low_settings = level_settings("low", low, extra=("n_hindsight_goals", "goal_strategy", "near_misses"))
         self.max_options, self.dt_min, self.dt_max = max_options, dt_min, dt_max
         self.window_end = window_end or self.default_window_end
         self.duration, self.fixed_duration = duration or self.default_duration, fixed_duration
@@ -271,6 +272,7 @@ class TBCHRL(BaseAlgorithm):
             settings["buffer_size"], observation, action, layout=self.layout, rules=self.rules,
             state_dim=self.low.state_dim, gamma=settings["gamma"],
             n_hindsight_goals=settings.get("n_hindsight_goals", self.n_hindsight_goals),
+            near_misses=settings.get("near_misses", 0.0),
             device=self.device, seed=seed, reward=self.low_level_reward,
             hindsight=settings.get("goal_strategy", self.goal_strategy) if untimed else "timed",
             sequence_length=self.sequence_length, reach_pairs=self.reachability is not None,
@@ -364,10 +366,9 @@ class TBCHRL(BaseAlgorithm):
         :param total_timesteps: environment steps to come, and those before a resumed run was stopped
         :param bar: the progress bar, if there is one
         """
-        few = self.gradient_ratio * total_timesteps < MIN_UPDATES_TO_COMPILE
-        compile = False if self.compile == "auto" and few else self.compile
         for level, settings in ((self.high, self.high_settings), (self.low, self.low_settings)):
-            name = level.log_prefix[:-1]
+            name, few = level.log_prefix[:-1], self._updates_of(settings, total_timesteps) < MIN_UPDATES_TO_COMPILE
+            compile = False if self.compile == "auto" and few else self.compile
             with described(bar, f"compiling the {name} level's update" if compile else ""):
                 seconds = level.prepare(settings["batch_size"], compile)
             if self.verbose and level.compiled:
@@ -401,15 +402,19 @@ class TBCHRL(BaseAlgorithm):
             return
         levels = zip((self.high, self.low), self.replay_buffer, (self.high_settings, self.low_settings), strict=True)
         for level, buffer, settings in levels:
-            ratio = self.gradient_ratio if settings["gradient_ratio"] is None else settings["gradient_ratio"]
-            updates = int(ratio * steps)
+            updates = self._updates_of(settings, steps)
             if updates and buffer.size() >= settings["batch_size"]:
                 level._current_progress_remaining = self._current_progress_remaining
                 level.train(updates, settings["batch_size"])
-        self._n_updates += int(self.gradient_ratio * steps)
+        self._n_updates = self.low._n_updates
         if self.reachability is not None:
             loss = self.reachability.train_on(self.replay_buffer.low, max(steps // UPDATE_EVERY, 1))
             self.logger.record("reachability/loss", loss)
+
+    def _updates_of(self, settings: Mapping[str, Any], steps: int) -> int:
+        """How often a level with these settings is updated for so many environment steps."""
+        ratio = self.gradient_ratio if settings["gradient_ratio"] is None else settings["gradient_ratio"]
+        return int(ratio * steps)
 
     def dump_logs(self) -> None:
         """Write what was seen since the last time: SB3's keys, and per level what explains learning."""

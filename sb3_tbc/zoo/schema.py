@@ -60,6 +60,7 @@ LEVEL: Schema = {
     "buffer_size": int,
     "n_hindsight_goals": NUMBER,
     "goal_strategy": frozenset({"future", "episode"}),
+    "near_misses": NUMBER,
     "policy_kwargs": POLICY,
 }
 RUN: Schema = {"n_timesteps": int, "n_envs": int, "env_kwargs": dict}
