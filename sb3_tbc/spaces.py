@@ -93,7 +93,7 @@ class SubgoalSpace:
         Neurons of moderate gain must tell a subgoal from its neighbours; scaled by its bounds alone, a threshold of
         4 % of the range moves them too little.
         """
-        return np.minimum(self.tolerance / 0.15, np.maximum(np.abs(self.low), np.abs(self.high)))
+        return np.asarray(np.minimum(self.tolerance / 0.15, np.maximum(np.abs(self.low), np.abs(self.high))))
 
     @property
     def tolerance(self) -> FloatArray:
