@@ -19,28 +19,23 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
-from sb3_tbc.hindsight import HighLevelReward, HindsightSettings, check_goal_strategy
+from sb3_tbc.hindsight import HighLevelReward, check_goal_strategy
 from sb3_tbc.layout import LevelLayout, check_goal_space
 from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import OptionRules
 from sb3_tbc.spaces import SubgoalSpace
-from sb3_tbc.tbc_hrl import resume
+from sb3_tbc.tbc_hrl import assembly, resume
 from sb3_tbc.tbc_hrl.bar import described, progress_bar_of
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, Exploration, goal_test_of
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
-from sb3_tbc.tbc_hrl.level import SACLevel
-from sb3_tbc.tbc_hrl.policies import LevelPolicy
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY, Reachability
 from sb3_tbc.tbc_hrl.replay import Replay
-from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
+from sb3_tbc.tbc_hrl.scheduling import FixedWindows, ReachRule
 from sb3_tbc.tbc_hrl.settings import (
-    DEFAULT_WIRING,
     LEVEL_DEFAULTS,
     attribute_of,
     check_settings,
     episode_length,
-    learning_rate_of,
     level_settings,
 )
 from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
@@ -214,11 +209,12 @@ class TBCHRL(BaseAlgorithm):
         self.high_settings, self.low_settings = (
             {**LEVEL_DEFAULTS, **s} for s in (self.high_settings, self.low_settings)
         )
-        self.high = self._make_level("high", self.high_settings, *high_spaces, seed=seeds[1])
-        self.low = self._make_level("low", self.low_settings, *low_spaces, seed=seeds[2])
+        self.high = assembly.make_high_level(self, *high_spaces, seed=seeds[1])
+        self.low = assembly.make_low_level(self, *low_spaces, seed=seeds[2])
         self._set_schedule(self.subgoals, seeds[6])
         self.replay_buffer = Replay(
-            self._make_high_buffer(*high_spaces, seeds[3]), self._make_low_buffer(*low_spaces, seeds[4])
+            assembly.make_high_buffer(self, *high_spaces, seeds[3]),
+            assembly.make_low_buffer(self, *low_spaces, seeds[4]),
         )
         self.high.attach(self.replay_buffer.high)
         self.low.attach(self.replay_buffer.low)
@@ -227,7 +223,7 @@ class TBCHRL(BaseAlgorithm):
         )
         self.store = EpisodeStore(
             self.replay_buffer, self.layout, self.rules, self.high_reward, self.low_level_reward,
-            self._hindsight_settings(), self.rng,
+            assembly.hindsight_settings(self), self.rng,
         )  # fmt: skip
         self.diagnostics = EpisodeDiagnostics()
 
@@ -257,36 +253,6 @@ class TBCHRL(BaseAlgorithm):
             self.rule = ReachRule(self.layout, self.rules, self.reachability, self.kappa)
             self.schedule = self.rule if self.duration == "rule" else None
 
-    def _make_high_buffer(self, observation: spaces.Box, action: spaces.Box, seed: int) -> OptionReplayBuffer:
-        taught = self.subgoals if self.duration_loss_coef else None
-        buffer = OptionReplayBuffer(
-            self.high_settings["buffer_size"], observation, action, device=self.device, seed=seed, context=taught
-        )
-        if self.duration_loss_coef:
-            buffer.teacher = DurationTeacher(self.rule, self.high)
-        return buffer
-
-    def _make_low_buffer(self, observation: spaces.Box, action: spaces.Box, seed: int) -> SubgoalReplayBuffer:
-        settings, untimed = self.low_settings, self.low_reward == "step"
-        buffer = SubgoalReplayBuffer(
-            settings["buffer_size"], observation, action, layout=self.layout, rules=self.rules,
-            state_dim=self.low.state_dim, gamma=settings["gamma"],
-            n_hindsight_goals=settings.get("n_hindsight_goals", self.n_hindsight_goals),
-            near_misses=settings.get("near_misses", 0.0),
-            device=self.device, seed=seed, reward=self.low_level_reward,
-            hindsight=settings.get("goal_strategy", self.goal_strategy) if untimed else "timed",
-            sequence_length=self.sequence_length, reach_pairs=self.reachability is not None,
-        )  # fmt: skip
-        buffer.advance = self.low.advance
-        return buffer
-
-    def _hindsight_settings(self) -> HindsightSettings:
-        penalty = -float(self.max_options) if self.testing_penalty is None else self.testing_penalty
-        return HindsightSettings(
-            int(self.n_hindsight_goals), self.goal_strategy, penalty, self.keep_original, self.relabel_tolerance,
-            self.goals_met,
-        )  # fmt: skip
-
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""
         if unwrap_vec_normalize(env) is not None:
@@ -300,25 +266,6 @@ class TBCHRL(BaseAlgorithm):
         self.achieved_in_observation = True if achieved_in_observation is None else bool(achieved_in_observation)
         if self.dt_max == -1:
             self.dt_max = episode_length(env) / self.max_options
-
-    def _make_level(
-        self, name: str, settings: dict[str, Any], observation: spaces.Box, action: spaces.Box, seed: int
-    ) -> SACLevel:
-        policy_kwargs = dict(settings["policy_kwargs"])
-        if name == "low":
-            default = {**DEFAULT_WIRING, "motor": action.shape[0]} if self.default_circuit else None
-            circuit = policy_kwargs.get("ndbc", default)
-            scale = {"input_scale": self.layout.low_scale().tolist()}
-            policy_kwargs["ndbc"] = None if circuit is None else {**scale, **circuit}
-            policy_kwargs.setdefault("negative_critic", self.low_reward == "step")
-        gamma, actor_rate = settings["gamma"], settings["actor_learning_rate"]
-        return SACLevel(
-            LevelPolicy, observation, action, None, learning_rate_of(settings["learning_rate"]), gamma, settings["tau"],
-            settings["ent_coef"], settings["target_entropy"], policy_kwargs, seed=seed, device=self.device,
-            compile=self.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"],
-            actor_learning_rate=None if actor_rate is None else learning_rate_of(actor_rate), name=name,
-            label_coef=self.duration_loss_coef if name == "high" else 0.0, average_decay=settings["average_decay"],
-        )  # fmt: skip
 
     # ------------------------------------------------------------------ learning
 
