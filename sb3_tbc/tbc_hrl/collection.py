@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.hindsight import (
+    GoalRange,
     GoalTest,
     HighLevelReward,
     HighLevelSteps,
@@ -143,6 +144,7 @@ class EpisodeStore:
     :param low_reward: the low level's reward
     :param hindsight: how much of it
     :param rng: draws hindsight goals and times
+    :param asked: the goals asked for so far, which limit those of hindsight; None does not limit them
     """
 
     def __init__(
@@ -154,17 +156,22 @@ class EpisodeStore:
         low_reward: LowLevelReward,
         hindsight: HindsightSettings,
         rng: np.random.Generator,
+        asked: GoalRange | None = None,
     ) -> None:
+        self.asked = asked
         self.replay, self.layout, self.rules = replay, layout, rules
         self.reward, self.low_reward, self.hindsight, self.rng = reward, low_reward, hindsight, rng
 
     def add(self, episode: Episode, goal_test: GoalTest) -> HighLevelSteps:
         """Store an episode; what the high level learns from it."""
         subgoals = self.layout.subgoals
+        if self.asked is not None:
+            self.asked.add(episode.desired_goal[0])
         self.replay.low.extend(low_level_steps(episode, subgoals, self.rules, self.low_reward))
         steps = high_level_steps(
-            episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.layout.high, self.rng
-        )
+            episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.layout.high, self.rng,
+            self.asked,
+        )  # fmt: skip
         self.replay.high.extend(steps)
         return steps
 

@@ -49,6 +49,8 @@ def get_state(model: TBCHRL) -> Arrays:
     if isinstance(actor, NDBCActor):
         plain["circuit"] = {"updates": actor.net.updates, "sub_steps": actor.net.sub_steps}
         arrays["direction"] = actor.net.lipschitz.direction.numpy().copy()
+    if model.store.asked is not None:
+        arrays["asked"] = model.store.asked.bounds
     if model.collector is not None and isinstance(model.collector.env.venv, GoalVecEnv):
         running = model.collector.env.venv.running
         plain["episodes"] = [{"seed": episode.seed, "generator": episode.generator} for episode in running]
@@ -77,6 +79,8 @@ def set_state(model: TBCHRL, collector: Collector, state: Mapping[str, NDArray[A
         if name in plain["generators"]:
             rng.bit_generator.state = plain["generators"][name]
     model.high._n_updates, model.low._n_updates = plain["n_updates"]
+    if model.store.asked is not None and "asked" in state:
+        model.store.asked.bounds = state["asked"]
     model.diagnostics.values.clear()
     model.diagnostics.values.update(plain["diagnostics"])
     actor = model.low.policy.actor

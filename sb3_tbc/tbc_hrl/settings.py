@@ -34,6 +34,7 @@ CHOICES = {
     "memory": ("window", "episode", "none"),
     "duration": ("joint", "rule", "fixed"),
     "goals_met": ("passing", "end"),
+    "hindsight_goals": ("all", "asked"),
 }
 
 DEFAULT_WIRING = {

@@ -19,8 +19,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tbc.hindsight import HighLevelReward, check_goal_strategy
-from sb3_tbc.layout import LevelLayout, check_goal_space
+from sb3_tbc.hindsight import GoalRange, HighLevelReward, check_goal_strategy
+from sb3_tbc.layout import LevelLayout, check_goal_space, width
 from sb3_tbc.low_reward import LowLevelReward
 from sb3_tbc.options import OptionRules
 from sb3_tbc.spaces import SubgoalSpace
@@ -87,6 +87,7 @@ class TBCHRL(BaseAlgorithm):
         options of the episode, or ``"event"``, the option that the task's event ended
     :param goals_met: when a window meets a hindsight goal: ``"passing"`` it, as the episode would have ended, or at its
         ``"end"`` alone, which HiTS's target always does
+    :param hindsight_goals: ``"all"``, or those ``"asked"``: within the box of the goals that episodes have asked for
     :param gradient_ratio: updates of each level per environment step, done in bursts after episodes
     :param learning_starts: environment steps before the first update
     :param memory: when the membrane is reset: ``"window"``, ``"episode"`` or ``"none"`` (every step)
@@ -136,6 +137,7 @@ class TBCHRL(BaseAlgorithm):
         n_hindsight_goals: float = 3,
         goal_strategy: str = "future",
         goals_met: str = "passing",
+        hindsight_goals: str = "all",
         gradient_ratio: float = 1.0,
         learning_starts: int = 0,
         memory: str = "none",
@@ -176,7 +178,7 @@ class TBCHRL(BaseAlgorithm):
         self.testing_penalty, self.keep_original = testing_penalty, keep_original
         self.relabel_tolerance = relabel_tolerance
         self.random_fraction, self.n_hindsight_goals = random_fraction, n_hindsight_goals
-        self.goal_strategy, self.goals_met = goal_strategy, goals_met
+        self.goal_strategy, self.goals_met, self.hindsight_goals = goal_strategy, goals_met, hindsight_goals
         self.gradient_ratio, self.learning_starts = gradient_ratio, learning_starts
         self.memory, self.sequence_length, self.compile = memory, sequence_length, compile
         self.subgoals, self.relative_subgoals = subgoals, relative_subgoals
@@ -224,6 +226,7 @@ class TBCHRL(BaseAlgorithm):
         self.store = EpisodeStore(
             self.replay_buffer, self.layout, self.rules, self.high_reward, self.low_level_reward,
             assembly.hindsight_settings(self), self.rng,
+            GoalRange(width(space, "desired_goal")) if self.hindsight_goals == "asked" else None,
         )  # fmt: skip
         self.diagnostics = EpisodeDiagnostics()
 

@@ -101,6 +101,7 @@ MODEL: Schema = {
     "n_hindsight_goals": NUMBER,
     "goal_strategy": frozenset({"future", "episode", "event"}),
     "goals_met": frozenset({"passing", "end"}),
+    "hindsight_goals": frozenset({"all", "asked"}),
     "gradient_ratio": NUMBER,
     "learning_starts": int,
     "memory": frozenset({"window", "episode", "none"}),
