@@ -10,6 +10,7 @@ from corridor import Corridor
 
 from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.hindsight import (
+    GoalRange,
     GoalTest,
     HighLevelReward,
     HindsightSettings,
@@ -137,6 +138,26 @@ def test_all_high_level_transitions_by_hand() -> None:
     np.testing.assert_array_equal(steps.relabelled, [False, True, False, True])
     np.testing.assert_allclose(steps.observations[3, 0], 0.5)  # the goal comes first in the high level's view
     np.testing.assert_allclose(steps.discounts, 0.9)
+
+
+@pytest.mark.parametrize(("asked", "copies"), [([0.4, 0.6], 1), ([0.5], 1), ([0.6, 0.9], 0), ([], 0)])
+def test_hindsight_goals_can_be_kept_within_those_asked_for(asked: list[float], copies: int) -> None:
+    reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=2.0)
+    settings = HindsightSettings(n_goals=1, goal_strategy="future", testing_penalty=-5.0, keep_original=False)
+    goals = GoalRange(1)
+    for goal in asked:
+        goals.add(np.array([goal]))
+    rng = np.random.default_rng(0)
+    steps = high_level_steps(episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, rng, goals)
+    assert len(steps.rewards) == 3 + copies  # the copy's goal is where the second option ended, 0.5
+
+
+def test_a_range_of_goals_is_a_box() -> None:
+    goals = GoalRange(2)
+    goals.add(np.array([0.0, 1.0]))
+    goals.add(np.array([1.0, -1.0]))
+    outside_or_in = np.array([[0.5, 0.0], [1.0, 1.0], [1.1, 0.0], [0.5, -1.1]])
+    assert goals.holds(outside_or_in).tolist() == [True, True, False, False]
 
 
 def test_ordered_pairs_are_uniform() -> None:
