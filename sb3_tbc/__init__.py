@@ -1,12 +1,13 @@
 """Hierarchical reinforcement learning with timed subgoals and bionic circuit networks, on Stable-Baselines3."""
 
-from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
-from sb3_tbc.evaluation import evaluate_hierarchical
+from sb3_tbc import former_names
 from sb3_tbc.ndbc import NDBCNet, NDBCWiring
-from sb3_tbc.spaces import SubgoalSpace
+from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
+from sb3_tbc.smdp import HierarchicalVecEnv
+from sb3_tbc.smdp.spaces import SubgoalSpace
 from sb3_tbc.tasks import register_tasks
 from sb3_tbc.tbc_hrl import HAC, TBCHRL, HiTS, TBCPolicy
-from sb3_tbc.vec_env import HierarchicalVecEnv
+from sb3_tbc.tbc_hrl.evaluation import evaluate_hierarchical
 
 __version__ = "0.1.0"
 
@@ -24,4 +25,5 @@ __all__ = [
     "evaluate_hierarchical",
 ]
 
+former_names.install()
 register_tasks()

@@ -1,5 +1,10 @@
 """Errors that name what went wrong inside a hierarchy; other user mistakes are ``ValueError`` or ``TypeError``."""
 
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
 
 class HierarchyError(RuntimeError):
     """The two levels were used out of order, e.g. stepping before a reset."""
@@ -11,3 +16,11 @@ class NonFiniteError(FloatingPointError):
 
 class ConfigError(ValueError):
     """A configuration names what does not exist or has the wrong type; the message names the nearest match."""
+
+
+def nearest(name: str, names: Iterable[str]) -> str:
+    """A hint that names the closest valid name, or lists them all when none is close."""
+    known = sorted(names)
+    lowered = {k.lower(): k for k in known}
+    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
+    return f"did you mean {lowered[close[0]]!r}?" if close else f"known: {', '.join(known)}"

@@ -9,10 +9,10 @@ from typing import Any
 
 import torch as th
 
-from sb3_tbc.callbacks import write_atomic
-from sb3_tbc.cli import Parser, positive_int, run_command
+from sb3_tbc.commands import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.evaluation import evaluate_agent
+from sb3_tbc.files import write_atomic
+from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, load_model, read_zip
 from sb3_tbc.zoo.environments import NAMESPACE, make_env, resolve_env
 from sb3_tbc.zoo.ledger import summarise, to_json
@@ -83,7 +83,7 @@ def command(argv: Sequence[str]) -> int:
     if args.json is not None:
         write_atomic(args.json, text)
     if args.video is not None:
-        from sb3_tbc.video import record_video
+        from sb3_tbc.zoo.video import record_video
 
         env = make_env(info["env_id"], **info["env_kwargs"])
         record_video(load_model(args.model, device=args.device), env, args.video, args.video_episodes, args.seed)

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_tbc.cli import INTERRUPTED, Parser, positive_int, run_command
+from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command
 from sb3_tbc.train import variant_name
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
 from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, load_config, parse_overrides

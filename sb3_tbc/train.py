@@ -12,7 +12,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_tbc.cli import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm

@@ -13,7 +13,7 @@ from gymnasium import logger, spaces
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_tbc.spaces import SubgoalSpace
+from sb3_tbc.smdp.spaces import SubgoalSpace
 
 with contextlib.redirect_stderr(io.StringIO()):  # Importing it prints a notice about environments not used here.
     from gymnasium_robotics.core import GoalEnv

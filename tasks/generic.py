@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
-from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
+from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
+from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array, GoalTask
 from .box2d import load_box2d

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import mujoco
 import numpy as np
 
-from sb3_tbc.spaces import FloatArray, GoalObservation, SubgoalSpace
+from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
 from .history import FrameHistory

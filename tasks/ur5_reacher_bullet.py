@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.spaces import SubgoalSpace
+from sb3_tbc.smdp.spaces import SubgoalSpace
 
 from .base import Array, GoalTask
 from .history import FrameHistory

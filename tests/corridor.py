@@ -8,7 +8,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium_robotics.core import GoalEnv
 
-from sb3_tbc.spaces import SubgoalSpace
+from sb3_tbc.smdp.spaces import SubgoalSpace
 
 
 def achieved(observation: Any) -> Any:

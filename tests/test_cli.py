@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 import yaml
 
-from sb3_tbc import __main__, evaluate, report, train
+from sb3_tbc import __main__, evaluate, train
+from sb3_tbc.report import command as report
 from sb3_tbc.zoo.ledger import RunFolder
 
 TINY = ["--hyperparams", "compile:false", "gradient_ratio:0.05", "low.batch_size:16", "high.batch_size:4"]
@@ -111,7 +112,7 @@ def test_resume_without_a_checkpoint(run: RunFolder, tmp_path: Path, capsys: pyt
 def test_ctrl_c_saves_and_resume_finishes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from sb3_tbc.callbacks import SuccessEvalCallback
+    from sb3_tbc.zoo.callbacks import SuccessEvalCallback
 
     original = SuccessEvalCallback._on_step
 

@@ -12,41 +12,27 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "sb3_tbc"
 
-# A module may import from its own layer and from layers below it. The longest matching prefix decides.
-LAYERS = {
-    "sb3_tbc": 0,
-    "sb3_tbc.type_aliases": 0,
-    "sb3_tbc.errors": 0,
-    "sb3_tbc.spaces": 0,
-    "sb3_tbc.stats": 0,
-    "sb3_tbc.tasks": 1,
-    "sb3_tbc.ndbc": 1,
-    "sb3_tbc.layout": 1,
-    "sb3_tbc.options": 2,
-    "sb3_tbc.hindsight": 2,
-    "sb3_tbc.low_reward": 2,
-    "sb3_tbc.plotting": 2,
-    "sb3_tbc.cli": 2,
-    "sb3_tbc.buffers": 3,
-    "sb3_tbc.ring_buffer": 3,
-    "sb3_tbc.vec_env": 3,
-    "sb3_tbc.tbc_hrl": 4,
-    "sb3_tbc.flat": 4,
-    "sb3_tbc.evaluation": 5,
-    "sb3_tbc.callbacks": 6,
-    "sb3_tbc.video": 6,
-    "sb3_tbc.zoo": 7,
-    "sb3_tbc.zoo.schema": 1,  # names and kinds alone: even the console script may look at it
-}
-COMMANDS = 8
-"""Everything else: train, evaluate, report, ..."""
+# From bottom to top: a folder (or a module beside the folders) imports from itself and from lower layers alone.
+LAYERS = (
+    ("former_names", "errors", "stats", "files"),
+    ("commands", "smdp"),
+    ("replay", "ndbc", "tasks", "zoo_configs"),
+    ("level",),
+    ("tbc_hrl",),
+    ("zoo",),
+    ("train", "evaluate", "report"),
+    ("tune", "export", "reproduce"),
+    ("benchmark",),
+    ("__main__",),
+)
+LAYER = {name: index for index, names in enumerate(LAYERS) for name in names}
 
 TASK_PACKAGES = {"gymnasium", "gymnasium_robotics", "numpy", "mujoco", "Box2D", "pybullet", "tkinter", "pygame"}
 NO_TORCH = (
     "sb3_tbc.tasks",
-    "sb3_tbc.spaces",
+    "sb3_tbc.smdp.spaces",
     "sb3_tbc.errors",
-    "sb3_tbc.options",
+    "sb3_tbc.smdp.options",
     "sb3_tbc.ndbc.wiring",
     "sb3_tbc.stats",
 )
@@ -97,22 +83,22 @@ def _at_import(tree: ast.AST) -> list[ast.AST]:
     return found
 
 
-def layer(name: str) -> int:
-    parts = name.split(".")
-    for length in range(len(parts), 1, -1):
-        prefix = ".".join(parts[:length])
-        if prefix in LAYERS:
-            return LAYERS[prefix]
-    return LAYERS["sb3_tbc"] if name == "sb3_tbc" else COMMANDS
+def place(name: str) -> str:
+    """Folder of a module, or the module itself where it lies beside the folders."""
+    return name.split(".")[1]
 
 
 @pytest.mark.parametrize("name", sorted(MODULES))
 def test_imports_point_downwards(name: str) -> None:
     if name == "sb3_tbc":
         return  # the front door shows what lies behind it
-    for imported in imports(name, everywhere=False):
-        if imported.split(".")[0] == "sb3_tbc":
-            assert layer(imported) <= layer(name), f"{name} must not import {imported}"
+    for imported in imports(name, everywhere=True):
+        if imported.startswith("sb3_tbc.") and place(imported) != place(name):
+            assert LAYER[place(imported)] < LAYER[place(name)], f"{name} must not import {imported}"
+
+
+def test_every_folder_has_a_layer() -> None:
+    assert {place(name) for name in MODULES if name != "sb3_tbc"} <= set(LAYER)
 
 
 @pytest.mark.parametrize("name", sorted(n for n in MODULES if n.startswith("sb3_tbc.tasks")))
@@ -120,7 +106,9 @@ def test_tasks_need_gymnasium_numpy_and_spaces_only(name: str) -> None:
     for imported in imports(name, everywhere=True):
         top = imported.split(".")[0]
         if top == "sb3_tbc":
-            assert imported.startswith(("sb3_tbc.tasks", "sb3_tbc.spaces", "sb3_tbc.errors")), f"{name}: {imported}"
+            assert imported.startswith(("sb3_tbc.tasks", "sb3_tbc.smdp.spaces", "sb3_tbc.errors")), (
+                f"{name}: {imported}"
+            )
         else:
             assert top in TASK_PACKAGES | set(sys.stdlib_module_names), f"{name} must not import {imported}"
 

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium import spaces
 
-from sb3_tbc.buffers import OptionReplayBuffer, SubgoalReplayBuffer
-from sb3_tbc.hindsight import HindsightSettings
-from sb3_tbc.tbc_hrl.level import SACLevel
-from sb3_tbc.tbc_hrl.policies import LevelPolicy
+from sb3_tbc.level.level import SACLevel
+from sb3_tbc.level.policies import LevelPolicy
+from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
+from sb3_tbc.smdp.hindsight import HindsightSettings
+from sb3_tbc.tbc_hrl.config import DEFAULT_WIRING, learning_rate_of
 from sb3_tbc.tbc_hrl.scheduling import DurationTeacher
-from sb3_tbc.tbc_hrl.settings import DEFAULT_WIRING, learning_rate_of
 
 if TYPE_CHECKING:
     from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 def make_high_level(model: TBCHRL, observation: spaces.Box, action: spaces.Box, seed: int) -> SACLevel:
     """The level that chooses subgoals and time budgets.
 
-    :param observation: what it sees, :meth:`~sb3_tbc.layout.LevelLayout.high_space`
-    :param action: what it chooses, :meth:`~sb3_tbc.layout.LevelLayout.high_action_space`
+    :param observation: what it sees, :meth:`~sb3_tbc.smdp.views.LevelLayout.high_space`
+    :param action: what it chooses, :meth:`~sb3_tbc.smdp.views.LevelLayout.high_action_space`
     """
     settings = model.high_settings
     return _make_level(

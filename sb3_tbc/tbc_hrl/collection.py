@@ -9,22 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.hindsight import (
+from sb3_tbc.level.level import SACLevel
+from sb3_tbc.replay.both_levels import Replay
+from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal, Schedule
+from sb3_tbc.smdp.hindsight import (
     GoalRange,
     GoalTest,
-    HighLevelReward,
     HighLevelSteps,
     HindsightSettings,
     high_level_steps,
     low_level_steps,
 )
-from sb3_tbc.layout import LevelLayout
-from sb3_tbc.low_reward import LowLevelReward
-from sb3_tbc.options import Episode, OptionRules
-from sb3_tbc.spaces import FloatArray, GoalObservation
-from sb3_tbc.tbc_hrl.level import SACLevel
-from sb3_tbc.tbc_hrl.replay import Replay
-from sb3_tbc.vec_env.hierarchical_vec_env import HierarchicalVecEnv, Proposal, Schedule
+from sb3_tbc.smdp.options import Episode, OptionRules
+from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
+from sb3_tbc.smdp.spaces import FloatArray, GoalObservation
+from sb3_tbc.smdp.views import LevelLayout
 
 
 class Exploration(NamedTuple):

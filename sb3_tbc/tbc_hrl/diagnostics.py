@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 
-from sb3_tbc.hindsight import HighLevelSteps
-from sb3_tbc.options import Episode
+from sb3_tbc.smdp.hindsight import HighLevelSteps
+from sb3_tbc.smdp.options import Episode
 
 
 class EpisodeDiagnostics:
@@ -37,3 +40,30 @@ class EpisodeDiagnostics:
         means = {name: float(np.mean(values)) for name, values in self.values.items()}
         self.values.clear()
         return means
+
+
+def progress_bar_of(callback: BaseCallback) -> Any | None:
+    """The bar that SB3 shows while learning; None without one.
+
+    :param callback: what ``learn`` calls, its training started
+    """
+    if isinstance(callback, CallbackList):
+        return next(filter(None, map(progress_bar_of, callback.callbacks)), None)
+    return callback.pbar if isinstance(callback, ProgressBarCallback) else None
+
+
+@contextmanager
+def described(bar: Any | None, text: str) -> Iterator[None]:
+    """Show a text on the bar for a while.
+
+    :param bar: a tqdm bar, or None: nothing is shown
+    :param text: what is going on
+    """
+    if bar is None or not text:
+        yield
+        return
+    bar.set_description(text)
+    try:
+        yield
+    finally:
+        bar.set_description(None)

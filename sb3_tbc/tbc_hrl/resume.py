@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.level.policies import NDBCActor
+from sb3_tbc.smdp.goal_vec_env import GoalVecEnv, RunningEpisode
 from sb3_tbc.tbc_hrl.collection import Collector
-from sb3_tbc.tbc_hrl.policies import NDBCActor
-from sb3_tbc.vec_env.goal_vec_env import GoalVecEnv, RunningEpisode
 
 if TYPE_CHECKING:
     from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL

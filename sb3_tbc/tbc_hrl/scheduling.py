@@ -6,11 +6,11 @@ import math
 
 import numpy as np
 
-from sb3_tbc.layout import LevelLayout
-from sb3_tbc.options import OptionRules
-from sb3_tbc.ring_buffer import Float32
-from sb3_tbc.spaces import FloatArray, GoalObservation
-from sb3_tbc.tbc_hrl.level import SACLevel
+from sb3_tbc.level.level import SACLevel
+from sb3_tbc.replay.ring import Float32
+from sb3_tbc.smdp.options import OptionRules
+from sb3_tbc.smdp.spaces import FloatArray, GoalObservation
+from sb3_tbc.smdp.views import LevelLayout
 from sb3_tbc.tbc_hrl.reachability import Reachability
 
 

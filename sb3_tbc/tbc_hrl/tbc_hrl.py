@@ -19,26 +19,19 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tbc.hindsight import GoalRange, HighLevelReward, check_goal_strategy
-from sb3_tbc.layout import LevelLayout, check_goal_space, width
-from sb3_tbc.low_reward import LowLevelReward
-from sb3_tbc.options import OptionRules
-from sb3_tbc.spaces import SubgoalSpace
+from sb3_tbc.replay.both_levels import Replay
+from sb3_tbc.smdp.hindsight import GoalRange, check_goal_strategy
+from sb3_tbc.smdp.options import OptionRules
+from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
+from sb3_tbc.smdp.spaces import SubgoalSpace
+from sb3_tbc.smdp.views import LevelLayout, check_goal_space, width
 from sb3_tbc.tbc_hrl import assembly, resume
-from sb3_tbc.tbc_hrl.bar import described, progress_bar_of
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, Exploration, goal_test_of
-from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
+from sb3_tbc.tbc_hrl.config import LEVEL_DEFAULTS, attribute_of, check_settings, episode_length, level_settings
+from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of
+from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY, Reachability
-from sb3_tbc.tbc_hrl.replay import Replay
 from sb3_tbc.tbc_hrl.scheduling import FixedWindows, ReachRule
-from sb3_tbc.tbc_hrl.settings import (
-    LEVEL_DEFAULTS,
-    attribute_of,
-    check_settings,
-    episode_length,
-    level_settings,
-)
-from sb3_tbc.tbc_hrl.two_level_policy import TBCPolicy
 
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
 
@@ -58,9 +51,9 @@ class TBCHRL(BaseAlgorithm):
         ``gamma`` is per decision
     :param low: settings of the low level, likewise; ``policy_kwargs["ndbc"]`` holds the circuit's wiring, None for an
         MLP actor; ``n_hindsight_goals`` and ``goal_strategy`` may differ from the high level's; ``near_misses`` is the
-        share of hindsight subgoals moved off the point reached, see :class:`~sb3_tbc.buffers.SubgoalReplayBuffer`
+        share of hindsight subgoals moved off the point reached, see :class:`.SubgoalReplayBuffer`
     :param max_options: high-level decisions allowed per episode
-    :param window_end: ``"timed"`` or ``"reached"``, see :class:`~sb3_tbc.options.OptionRules`
+    :param window_end: ``"timed"`` or ``"reached"``, see :class:`~sb3_tbc.smdp.options.OptionRules`
     :param dt_min: shortest time budget, environment steps
     :param dt_max: longest, or -1 for the episode's length divided by ``max_options``
     :param duration: who sets the time budget: ``"joint"`` (the high level, with the subgoal), ``"rule"`` (equation 1:
@@ -70,11 +63,11 @@ class TBCHRL(BaseAlgorithm):
     :param duration_loss_coef: weight of the loss that draws the high level's time budget toward the rule's, in unit
         action coordinates; 0 leaves it out
     :param remaining_time: whether the low level sees how much of its time budget is left
-    :param target: ``"smdp"`` (paper) or ``"decision"`` (HiTS), see :class:`~sb3_tbc.hindsight.HighLevelReward`
+    :param target: ``"smdp"`` (paper) or ``"decision"`` (HiTS), see :class:`~sb3_tbc.smdp.hindsight.HighLevelReward`
     :param decision_cost: price of one decision
     :param duration_cost: price of the longest time budget
     :param completion_bonus: added to the reward of options that reach their subgoal, in hindsight too
-    :param low_reward: ``"sparse"``, ``"dense"`` or ``"step"``, see :class:`~sb3_tbc.low_reward.LowLevelReward`
+    :param low_reward: ``"sparse"``, ``"dense"`` or ``"step"``, see :class:`~sb3_tbc.smdp.rewards.LowLevelReward`
     :param testing_fraction: share of options that test their subgoal
     :param deterministic_testing: whether the low level acts deterministically in a test (the public HiTS does not)
     :param testing_penalty: reward of a failed test, None for ``-max_options``

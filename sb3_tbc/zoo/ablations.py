@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 from stable_baselines3.common.torch_layers import get_actor_critic_arch
 
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.level.level import SACLevel
 from sb3_tbc.tbc_hrl import TBCHRL
-from sb3_tbc.tbc_hrl.level import SACLevel
 from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import RunConfig, merge
 from sb3_tbc.zoo.environments import make_envs

@@ -9,12 +9,11 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.errors import ConfigError
-from sb3_tbc.flat import FlatSAC
+from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.tbc_hrl import HAC, TBCHRL, HiTS
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.environments import make_envs
-from sb3_tbc.zoo.schema import nearest
 
 Agent = TBCHRL | FlatSAC
 ALGORITHMS: dict[str, type[TBCHRL] | type[FlatSAC]] = {"tbc-hrl": TBCHRL, "hits": HiTS, "hac": HAC, "sac": FlatSAC}

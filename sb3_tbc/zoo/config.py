@@ -10,8 +10,8 @@ from typing import Any
 
 import yaml
 
-from sb3_tbc.errors import ConfigError
-from sb3_tbc.zoo.schema import RUN, SECTION, coerce, nearest, validate
+from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.zoo.schema import RUN, SECTION, coerce, validate
 
 CONFIGS = ("paper", "tuned")
 ABLATIONS: dict[str, dict[str, Any]] = {

@@ -14,11 +14,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 import sb3_tbc  # noqa: F401  (registers the tasks)
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly
 from sb3_tbc.tasks.generic import DescribedGoalEnv
-from sb3_tbc.vec_env.goal_vec_env import GoalVecEnv
-from sb3_tbc.zoo.schema import nearest
 
 NAMESPACE = "sb3_tbc/"
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")

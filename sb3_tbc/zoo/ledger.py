@@ -18,9 +18,10 @@ import torch as th
 import yaml
 from numpy.typing import NDArray
 
-from sb3_tbc.callbacks import EvaluationRow, finite_mean, read_evaluations, write_atomic, write_evaluations
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.files import write_atomic
 from sb3_tbc.stats import stability, wilson_interval
+from sb3_tbc.zoo.callbacks import EvaluationRow, finite_mean, read_evaluations, write_evaluations
 
 CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL = (
     "config.yml",

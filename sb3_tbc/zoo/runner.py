@@ -14,16 +14,11 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.callbacks import (
-    OptionTraceCallback,
-    SuccessEvalCallback,
-    TimedCheckpointCallback,
-    save_atomic,
-    write_atomic,
-)
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.evaluation import evaluate_agent
+from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, Agent, build_model, load_model
+from sb3_tbc.zoo.callbacks import OptionTraceCallback, SuccessEvalCallback, TimedCheckpointCallback
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise, to_json

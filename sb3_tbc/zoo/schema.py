@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, nearest
 
 Schema = dict[str, Any]
 """Key -> kind: a type, a tuple of types, a frozenset of allowed strings, :class:`ListOf`, or a nested schema.
@@ -118,14 +117,6 @@ FLAT: Schema = {
 """What an agent of one level takes at the top of a section, besides some of :data:`MODEL`'s keys."""
 
 SECTION: Schema = {**RUN, "subgoals": SUBGOALS, **MODEL, **FLAT}
-
-
-def nearest(name: str, names: Iterable[str]) -> str:
-    """A hint that names the closest valid name, or lists them all when none is close."""
-    known = sorted(names)
-    lowered = {k.lower(): k for k in known}
-    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.5)
-    return f"did you mean {lowered[close[0]]!r}?" if close else f"known: {', '.join(known)}"
 
 
 def coerce(value: Any) -> Any:

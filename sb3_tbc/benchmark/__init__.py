@@ -1,0 +1,1 @@
+"""Timings of this package beside others, taken in turns in one run."""

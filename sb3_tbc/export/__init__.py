@@ -1,0 +1,1 @@
+"""The whole two-level policy as ONNX, C99 or a NumPy-only module."""

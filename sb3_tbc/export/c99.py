@@ -1,0 +1,241 @@
+"""The policy as one C99 file: no allocation, no dependency beyond ``math.h``; integrated and closed form."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from importlib.resources import files
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy, FloatArray
+
+
+def to_c(policy: ExportedPolicy) -> str:
+    """Source text of the policy; its head says how it is used.
+
+    :param policy: what to export
+    """
+    data, code = _low_level(policy.low)
+    values = {
+        "TASK": re.sub(r"[^A-Za-z0-9_.-]", "_", policy.task),
+        "SIZES": _sizes(policy),
+        "LOW_DATA": data,
+        "LOW_CODE": code,
+        "HIGH_DATA": _mlp("high", policy.high) + _option_data(policy),
+        "ACHIEVED": "\n".join(_coordinate(i, c) for i, c in enumerate(policy.achieved)) or "    (void)entries;",
+        "REACHED": _reached(policy),
+        "EVENT": ""
+        if policy.event is None
+        else f"\n        || (state->elapsed > 0 && observation[{policy.event}] > 0.5f)",
+        "HIGH_INPUTS": _high_inputs(policy),
+        "FORGET": {"window": "over", "episode": "started", "none": "1"}[policy.memory],
+        "ASKED": "(state->subgoal[i] - here[i])" if policy.relative_subgoals else "state->subgoal[i]",
+        "UNITS": str(policy.subgoal_dim + (policy.fixed_budget is None)),
+        "BUDGET": _CHOSEN if policy.fixed_budget is None else repr(policy.fixed_budget),
+        "REMAINING": _REMAINING if policy.remaining_time else "",
+        "LOCAL": str(len(policy.local)),
+    }
+    text = _template("policy.c")
+    for name, value in values.items():
+        text = text.replace(f"@{name}@", value)
+    return text
+
+
+def _template(name: str) -> str:
+    return (files("sb3_tbc.export") / "templates" / name).read_text(encoding="utf-8")
+
+
+def _low_level(low: MLP | Circuit | Dissipative) -> tuple[str, str]:
+    """Data and code."""
+    if isinstance(low, Circuit):
+        return _circuit(low), _template("circuit.c")
+    if isinstance(low, Dissipative):
+        return _dissipative(low), _template("dissipative.c")
+    return _mlp("low", low), _LOW_MLP
+
+
+def _sizes(policy: ExportedPolicy) -> str:
+    sizes = {
+        "OBSERVATION": policy.n_observation,
+        "ACHIEVED_GOAL": policy.n_achieved,
+        "DESIRED_GOAL": policy.n_desired,
+        "ACTION": len(policy.action_low),
+        "SUBGOAL": policy.subgoal_dim,
+        "LOW_INPUT": policy.n_low_inputs,
+        "STATE": policy.state_dim,
+    }
+    return "\n".join(f"#define TBC_{name} {size}" for name, size in sizes.items())
+
+
+def floats(values: FloatArray) -> str:
+    """Single-precision literals that read back exactly."""
+    literals = [f"{np.float32(v):.9g}" for v in np.asarray(values).ravel()]
+    return ", ".join((x if any(c in x for c in ".en") else x + ".0") + "f" for x in literals)
+
+
+def array(name: str, values: FloatArray, kind: str = "tbc_real") -> str:
+    """A constant array of single-precision numbers, in the precision of what is computed with them: that is faster."""
+    return f"static const {kind} {name}[{max(1, np.size(values))}] = {{{floats(values) or '0.0f'}}};\n"
+
+
+def exact(name: str, values: FloatArray) -> str:
+    """A constant array of products, which single precision would round."""
+    listed = ", ".join(repr(float(v)) for v in np.asarray(values, np.float64).ravel())
+    return f"static const tbc_real {name}[{max(1, np.size(values))}] = {{{listed or '0.0'}}};\n"
+
+
+def _indices(name: str, values: NDArray[np.integer]) -> str:
+    kind = "unsigned char" if values.max(initial=0) < 256 else "unsigned short"
+    listed = ", ".join(str(int(v)) for v in values) or "0"
+    return f"static const {kind} {name}[{max(1, len(values))}] = {{{listed}}};\n"
+
+
+def _sparse(
+    name: str, matrix: FloatArray, columns: dict[str, FloatArray], write: Callable[[str, FloatArray], str] = array
+) -> str:
+    """Compressed rows by postsynaptic neuron: where rows begin, presynaptic indices, and one array per column set."""
+    present = matrix.T != 0
+    post, pre = np.nonzero(present)
+    begin = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+    text = _indices(f"{name}_begin", begin) + _indices(f"{name}_pre", pre)
+    return text + "".join(write(f"{name}_{column}", values[pre, post]) for column, values in columns.items())
+
+
+def _circuit(c: Circuit) -> str:
+    n, (inputs, inter) = c.n_neurons, c.current_weight.shape
+    sensory, currents = c.from_inputs[:inputs], c.from_inputs[inputs:]
+    sizes = {"SENSORY": inputs, "INTER": inter, "PRESYNAPTIC": len(c.gain), "SUB_STEPS": c.sub_steps}
+    text = "".join(f"#define TBC_{name} {size}\n" for name, size in sizes.items())
+    order = np.concatenate(c.order)
+    turn = np.argsort(order)
+    early = [j for j, heard in enumerate(c.recurrent[:, n:] != 0) if (turn[:n][heard] <= turn[j]).any()]
+    text += f"#define TBC_LOOPS {len(early)}\n" + _indices("heard_early", np.array(early, dtype=int))
+    text += _indices("relaxation_order", order)
+    input_gain = c.input_gain.astype(np.float64)
+    text += exact("sensory_gain", c.sensory_gain * input_gain) + array("sensory_threshold", c.sensory_threshold)
+    text += array("gain", c.gain) + array("threshold", c.threshold)
+    text += array("rest_weighted", c.rest[:n]) + array("rest_total", c.rest[n:])
+    text += array("capacitance", c.capacitance) + array("current_bias", c.current_bias)
+    text += array("input_conductance", currents[np.arange(inter), np.arange(inter)])
+    text += _sparse("current", c.current_weight, {"weight": c.current_weight * input_gain[:, None]}, exact)
+    text += _sparse("sensory", sensory[:, n:], {"weighted": sensory[:, :n], "total": sensory[:, n:]})
+    text += _sparse("recurrent", c.recurrent[:, n:], {"weighted": c.recurrent[:, :n], "total": c.recurrent[:, n:]})
+    return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
+
+
+def _dissipative(c: Dissipative) -> str:
+    text = f"#define TBC_SUB_STEPS {c.sub_steps}\n#define TBC_ETA {floats(np.array(c.eta))}\n"
+    text += _sparse("input", c.input_weight, {"weight": c.input_weight}) + array("input_bias", c.bias)
+    text += _sparse("recurrent", c.recurrent, {"weight": c.recurrent}) + array("shrink", c.shrink)
+    return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
+
+
+_CHOSEN = """TBC_DT_MIN
+        + 0.5 * ((double)(float)squash(unit[TBC_SUBGOAL], TBC_HIGH_BOUND) + 1.0) * (TBC_DT_MAX - TBC_DT_MIN)"""
+_REMAINING = """
+    seen[TBC_LOW_INPUT - 1] = (float)fmax(0.0, fmin((state->time_budget - state->elapsed) / TBC_DT_MAX, 1.0));"""
+_LOW_MLP = """
+void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT], int closed_form,
+                  float mean[TBC_ACTION])
+{
+    (void)membrane;
+    (void)closed_form;
+    low_network(seen, mean);
+}
+"""
+
+
+def _mlp(name: str, mlp: MLP) -> str:
+    """Weights and one function ``<name>_network(x, y)``."""
+    text, code, source = "", "", "in"
+    last = len(mlp.weights) - 1
+    n_in, n_out = len(mlp.weights[0]), len(mlp.biases[-1])
+    for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
+        inputs, outputs = weight.shape
+        text += array(f"{name}_w{i}", weight.T) + array(f"{name}_b{i}", bias)
+        target = f"h{i}"
+        activation = "linear" if i == last else mlp.activation
+        code += f"    tbc_real h{i}[{outputs}];\n"
+        code += f"    dense_{activation}({inputs}, {outputs}, {name}_w{i}, {name}_b{i}, {source}, {target});\n"
+        source = target
+    declared = "".join(line + "\n" for line in code.splitlines() if line.startswith("    tbc_real"))
+    called = "".join(line + "\n" for line in code.splitlines() if not line.startswith("    tbc_real"))
+    used = {mlp.activation, "linear"} if last else {"linear"}
+    dense = "".join(
+        _DENSE.replace("@KIND@", k).replace("@RULE@", _RULES[k]).replace("@NAME@", name) for k in sorted(used)
+    )
+    called = re.sub(r"dense_", f"{name}_dense_", called)
+    declared = f"    tbc_real in[{n_in}];\n{declared}    int i;\n"
+    read = f"    for (i = 0; i < {n_in}; ++i) {{\n        in[i] = x[i];\n    }}\n"
+    written = f"    for (i = 0; i < {n_out}; ++i) {{\n        y[i] = (float){source}[i];\n    }}\n"
+    body = declared + read + called + written
+    return f"{text}\n{dense}\nstatic void {name}_network(const float *x, float *y)\n{{\n{body}}}\n"
+
+
+_RULES = {"linear": "sum", "relu": "(sum > 0 ? sum : 0)", "tanh": "TBC_TANH(sum)"}
+_DENSE = """
+static void @NAME@_dense_@KIND@(int inputs, int outputs, const tbc_real *w, const tbc_real *b, const tbc_real *x,
+                                tbc_real *y)
+{
+    int i, j;
+    for (j = 0; j < outputs; ++j) {
+        tbc_real sum = b[j];
+        for (i = 0; i < inputs; ++i) {
+            sum += w[j * inputs + i] * x[i];
+        }
+        y[j] = @RULE@;
+    }
+}
+"""
+
+
+def _doubles(name: str, values: FloatArray) -> str:
+    return f"static const double {name}[{len(values)}] = {{{', '.join(repr(float(v)) for v in values)}}};\n"
+
+
+def _option_data(policy: ExportedPolicy) -> str:
+    text = _indices("local_entry", np.array(policy.local))
+    text += _doubles("subgoal_low", policy.subgoal_low) + _doubles("subgoal_high", policy.subgoal_high)
+    text += array("action_low", policy.action_low, "float") + array("action_high", policy.action_high, "float")
+    bounds = [b if np.isfinite(b) else np.finfo(np.float32).max for b in policy.mean_bounds]
+    text += (
+        f"#define TBC_HIGH_BOUND {floats(np.array(bounds[0]))}\n#define TBC_LOW_BOUND {floats(np.array(bounds[1]))}\n"
+    )
+    return text + f"#define TBC_DT_MIN {policy.dt_min!r}\n#define TBC_DT_MAX {policy.dt_max!r}\n"
+
+
+def _coordinate(index: int, c: Coordinate) -> str:
+    if c.kind == "angle":
+        return f"    here[{index}] = (tbc_real)atan2(entries[{c.first}], entries[{c.second}]);"
+    if c.kind == "wrap":
+        return f"    here[{index}] = (tbc_real)fmod(entries[{c.first}], {c.high!r});"
+    value = f"entries[{c.first}]"
+    value = f"fmin({value}, {c.high!r})" if np.isfinite(c.high) else value
+    value = f"fmax({value}, {c.low!r})" if np.isfinite(c.low) else value
+    return f"    here[{index}] = (tbc_real){value};"
+
+
+def _reached(policy: ExportedPolicy) -> str:
+    if policy.window_end != "reached":
+        return "    (void)here;\n    (void)subgoal;\n    return 0;"
+    tests = []
+    for group, threshold in zip(policy.groups, policy.thresholds, strict=True):
+        squares = " + ".join(f"(here[{i}] - subgoal[{i}]) * (here[{i}] - subgoal[{i}])" for i in group)
+        tests.append(f"sqrt({squares}) < {float(threshold)!r}")
+    return "    return " + "\n        && ".join(tests) + ";"
+
+
+def _high_inputs(policy: ExportedPolicy) -> str:
+    parts = [("desired_goal", policy.n_desired), ("observation", policy.n_observation)]
+    if not policy.achieved_in_observation:
+        parts.append(("achieved_goal", policy.n_achieved))
+    lines = [f"    float seen[{sum(size for _, size in parts)}];"]
+    start = 0
+    for name, size in parts:
+        lines.append(f"    memcpy(seen + {start}, {name}, {size} * sizeof(float));")
+        start += size
+    if policy.achieved_in_observation:
+        lines.append("    (void)achieved_goal;")
+    return "\n".join(lines)

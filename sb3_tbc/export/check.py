@@ -1,0 +1,367 @@
+"""Playing an exported policy beside the agent it came from, and what it costs on a microcontroller."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.util
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.export.policy import Circuit, ExportedPolicy
+from sb3_tbc.tbc_hrl import TBCHRL
+
+STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
+CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=c99")
+CLOSED_FORM_TOLERANCE = 0.05
+"""Larger differences of actions, as a share of half their range, draw a warning."""
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+
+Observation = Mapping[str, NDArray[Any]]
+
+
+class Player(Protocol):
+    """An exported policy in use."""
+
+    def reset(self) -> None:
+        """Begin an episode."""
+
+    def step(self, observation: Observation) -> NDArray[Any]:
+        """The action for an observation."""
+
+
+class NumpyPlayer:
+    """Plays an exported NumPy module.
+
+    :param path: the module
+    """
+
+    def __init__(self, path: Path) -> None:
+        spec = importlib.util.spec_from_file_location(f"exported_{path.stem.replace('-', '_')}", path)
+        if spec is None or spec.loader is None:
+            raise ConfigError(f"{path} is not a Python module")
+        self.module: Any = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(self.module)
+        self.closed_form = False
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.state = self.module.initial_state()
+
+    def step(self, observation: Observation) -> NDArray[Any]:
+        """The action for an observation."""
+        self.module.CLOSED_FORM = self.closed_form
+        action, self.state = self.module.step(*(observation[key] for key in GOAL_KEYS), self.state)
+        return np.asarray(action)
+
+
+class OnnxPlayer:
+    """Plays an exported ONNX graph in onnxruntime.
+
+    :param path: the graph
+    :raises ConfigError: if onnxruntime is not installed
+    """
+
+    def __init__(self, path: Path) -> None:
+        if importlib.util.find_spec("onnxruntime") is None:
+            raise ConfigError("playing an ONNX policy needs onnxruntime: pip install onnxruntime")
+        import onnxruntime
+
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        self.inputs = [i for i in self.session.get_inputs() if i.name not in GOAL_KEYS]
+        self.outputs = [o.name for o in self.session.get_outputs()]
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        kinds = {"tensor(float)": np.float32, "tensor(double)": np.float64}
+        self.state = {i.name: np.zeros((1, i.shape[1]), kinds[i.type]) for i in self.inputs}
+        self.state["elapsed"] -= 1.0
+
+    def step(self, observation: Observation) -> NDArray[Any]:
+        """The action for an observation."""
+        goal = {key: np.asarray(observation[key], np.float32)[None] for key in GOAL_KEYS}
+        results = dict(zip(self.outputs, self.session.run(None, {**goal, **self.state}), strict=True))
+        self.state = {name: results[f"next_{name}"] for name in self.state}
+        return np.asarray(results["action"][0])
+
+
+class CPlayer:
+    """Compiles an exported C file with all warnings as errors, and plays it.
+
+    :param path: the C file
+    :param policy: what it was exported from, for the sizes
+    :param flags: further compiler options
+    :raises ConfigError: if there is no C compiler
+    """
+
+    def __init__(self, path: Path, policy: ExportedPolicy, flags: tuple[str, ...] = ("-O2",)) -> None:
+        compiler = shutil.which("cc") or shutil.which("gcc")
+        if compiler is None:
+            raise ConfigError("checking a C policy needs a C compiler (cc or gcc)")
+        self._folder = tempfile.TemporaryDirectory()
+        library = Path(self._folder.name) / "policy.so"
+        command = [compiler, *STRICT, *flags, "-shared", "-fPIC", str(path), "-o", str(library), "-lm"]
+        subprocess.run(command, check=True, capture_output=True, text=True)
+        self.library = ctypes.CDLL(str(library))
+        self.policy, self.closed_form = policy, False
+        self._state = ctypes.create_string_buffer(64 + 8 * (policy.subgoal_dim + policy.state_dim))
+        self._action = np.zeros(len(policy.action_low), np.float32)
+        self.reset()
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.library.tbc_reset(self._state)
+
+    def step(self, observation: Observation) -> NDArray[Any]:
+        """The action for an observation."""
+        goal = [np.ascontiguousarray(observation[key], np.float32) for key in GOAL_KEYS]
+        pointers = [part.ctypes.data_as(ctypes.c_void_p) for part in (*goal, self._action)]
+        self.library.tbc_step(self._state, *pointers[:3], int(self.closed_form), pointers[3])
+        return self._action.copy()
+
+    def low_step_seconds(self, closed_form: bool = False, calls: int = 200) -> float:
+        """Seconds per low-level step at best, the price of the call from Python taken off."""
+        membrane = np.zeros(self.policy.state_dim + 1, np.float32)
+        seen, mean = np.full(self.policy.n_low_inputs, 0.3, np.float32), np.zeros_like(self._action)
+        pointers = [part.ctypes.data_as(ctypes.c_void_p) for part in (membrane, seen, mean)]
+        step, reset = self.library.tbc_low_mean, self.library.tbc_reset
+        best = [np.inf, np.inf]
+        for _ in range(300):
+            start = time.perf_counter()
+            for _ in range(calls):
+                step(pointers[0], pointers[1], int(closed_form), pointers[2])
+            middle = time.perf_counter()
+            for _ in range(calls):
+                reset(self._state)
+            end = time.perf_counter()
+            best = [min(best[0], middle - start), min(best[1], end - middle)]
+        return float(best[0] - best[1]) / calls
+
+
+class Score(NamedTuple):
+    """Finished episodes and how many of them succeeded."""
+
+    finished: int
+    successes: int
+
+    def __str__(self) -> str:
+        return f"{self.successes} of {self.finished} episodes"
+
+
+class CheckResult(NamedTuple):
+    """What a comparison found."""
+
+    steps: int
+    episodes: int
+    windows: int
+    max_difference: float
+    rms_difference: float
+    score: Score
+
+    def __str__(self) -> str:
+        return (
+            f"checked: {self.steps} steps, {self.episodes} episodes, {self.windows} windows; largest difference from "
+            f"predict(deterministic=True): {self.max_difference:.2g}"
+        )
+
+
+class ClosedFormResult(NamedTuple):
+    """The closed form beside the agent on the states the agent meets, and what each achieves alone."""
+
+    beside: CheckResult
+    alone: Score
+    half_range: float  # of the widest action
+
+    @property
+    def share(self) -> float:
+        """Root mean square difference of actions as a share of half their range."""
+        return self.beside.rms_difference / self.half_range
+
+    def __str__(self) -> str:
+        text = (
+            f"closed form: actions differ from predict's by {self.beside.rms_difference:.2g} rms and "
+            f"{self.beside.max_difference:.2g} at most; acting alone for {self.beside.steps} steps it succeeds in "
+            f"{self.alone}, the agent in {self.beside.score}"
+        )
+        if self.share <= CLOSED_FORM_TOLERANCE:
+            return text
+        return (
+            f"{text}\nWARNING: the closed form does not act as this agent does (rms {self.share:.0%} of half the range "
+            "of actions): deploy the integrated form. Agents that carry their potentials on (memory window or episode) "
+            "come closer to it than those that start every step from rest."
+        )
+
+
+def player(kind: str, path: Path, policy: ExportedPolicy) -> Player:
+    """The player for a format."""
+    if kind == "c":
+        return CPlayer(path, policy)
+    return NumpyPlayer(path) if kind == "numpy" else OnnxPlayer(path)
+
+
+def check(
+    model: TBCHRL, policy: ExportedPolicy, kind: str, path: Path, info: Mapping[str, Any], steps: int, seed: int
+) -> str:
+    """Play the exported policy beside ``predict(deterministic=True)`` on the observations the agent meets.
+
+    :param model: the agent
+    :param policy: what was exported
+    :param kind: ``"onnx"``, ``"c"`` or ``"numpy"``
+    :param path: the exported file
+    :param info: ``env_id`` and ``env_kwargs`` of the task
+    :param steps: environment steps; episodes follow one another
+    :param seed: of the first episode
+    :return: what to print: the comparison, how well a circuit's closed form does, and the time of a step in C
+    """
+    env = gym.make(info["env_id"], **(info.get("env_kwargs") or {}))
+    exported = player(kind, path, policy)
+    try:
+        lines = [str(compare(model, exported, env, steps, seed))]
+        if isinstance(policy.low, Circuit) and isinstance(exported, CPlayer | NumpyPlayer):
+            lines.append(str(compare_closed_form(model, exported, env, steps, seed)))
+        if isinstance(exported, CPlayer):
+            lines.append(f"one low-level step on this machine: {1e6 * exported.low_step_seconds():.2f} us")
+        return "\n".join(lines)
+    finally:
+        env.close()
+
+
+def compare(model: TBCHRL, exported: Player, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> CheckResult:
+    """The comparison itself, see :func:`check`."""
+    beside = _Beside(model, exported)
+    score = play(beside, env, steps, seed)
+    difference = np.abs(beside.differences)
+    rms = float(np.sqrt(np.mean(difference**2)))
+    return CheckResult(steps, beside.episodes, beside.windows, float(difference.max()), rms, score)
+
+
+def compare_closed_form(
+    model: TBCHRL, exported: CPlayer | NumpyPlayer, env: gym.Env[Any, Any], steps: int, seed: int = 0
+) -> ClosedFormResult:
+    """The closed form of an exported circuit beside the agent, and then alone."""
+    exported.closed_form = True
+    exported.reset()
+    beside = compare(model, exported, env, steps, seed)
+    exported.reset()
+    actions: Any = model.action_space
+    half_range = 0.5 * float(np.max(actions.high - actions.low))
+    return ClosedFormResult(beside, play(exported, env, steps, seed), half_range)
+
+
+def play(who: Player, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> Score:
+    """Let a player act for some steps; episodes follow one another, the last one is cut."""
+    observation, _ = env.reset(seed=seed)
+    finished = successes = 0
+    for _ in range(steps):
+        observation, _, terminated, truncated, info = env.step(who.step(observation))
+        if terminated or truncated:
+            finished, successes = finished + 1, successes + int(info.get("is_success", False))
+            observation, _ = env.reset()
+            who.reset()
+    return Score(finished, successes)
+
+
+class _Beside:
+    """A player that acts as the agent does and notes how far an exported policy would have differed."""
+
+    def __init__(self, model: TBCHRL, exported: Player) -> None:
+        self.model, self.exported = model, exported
+        self.state: tuple[NDArray[Any], ...] | None = None
+        self.differences: list[NDArray[Any]] = []
+        self.episodes, self.windows = 1, 0
+
+    def reset(self) -> None:
+        """Begin an episode."""
+        self.exported.reset()
+        self.state = None
+        self.episodes += 1
+
+    def step(self, observation: Observation) -> NDArray[Any]:
+        """The agent's action for an observation."""
+        action, self.state = self.model.predict(dict(observation), self.state, deterministic=True)
+        self.differences.append(action - self.exported.step(observation))
+        self.windows += int(self.state is not None and self.state[2][0] == 1)
+        return action
+
+
+class Cortex(NamedTuple):
+    """Bytes on a Cortex-M4 of the low level alone."""
+
+    flash: int  # code and constants, without the mathematical library
+    library: int  # expf and tanhf, as linked
+    stack: int
+    state: int
+
+
+def cortex_m4(path: Path) -> Cortex | None:
+    """Size of an exported C file's low level, compiled with ``-Os``; None without ``arm-none-eabi-gcc``."""
+    compiler = shutil.which("arm-none-eabi-gcc")
+    if compiler is None:
+        return None
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        source, target = folder / "policy.c", folder / "policy.o"
+        source.write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
+        run = [compiler, *CORTEX_M4, "-ffunction-sections", "-fdata-sections"]
+        flags = ["-DTBC_SINGLE", "-DTBC_LOW_LEVEL_ONLY", "-fstack-usage", "-c", str(source), "-o", str(target)]
+        subprocess.run([*run, *flags], check=True, capture_output=True)
+        usage = (folder / "policy.su").read_text(encoding="utf-8")
+        flash, data, bss = _sections(target)
+        library = _linked(run, folder, source) - flash
+    state = 4 * (int(_macro(path, "TBC_STATE")) + 1)
+    return Cortex(flash + data, library, sum(int(n) for n in re.findall(r"\t(\d+)\t", usage)), state + bss)
+
+
+def cortex_m4_report(path: Path) -> str:
+    """The sizes as one line."""
+    size = cortex_m4(path)
+    if size is None:
+        return "Cortex-M4 size: not measured (arm-none-eabi-gcc not found; Debian: apt install gcc-arm-none-eabi)"
+    return (
+        f"Cortex-M4, low level in single precision: {size.flash} bytes of flash, {size.library} more for the "
+        f"mathematical library; RAM {size.state} bytes of state and at most {size.stack} of stack"
+    )
+
+
+def _linked(run: list[str], folder: Path, source: Path) -> int:
+    """Flash of a linked program with the low level, less that of an empty one."""
+    call = "static volatile float m[TBC_STATE + 1], s[TBC_LOW_INPUT], a[TBC_ACTION];\n"
+    call += "int main(void) { tbc_low_mean((float *)m, (const float *)s, (int)m[0], (float *)a); return 0; }\n"
+    programs = {"full": f'#include "{source.name}"\n{call}', "empty": "int main(void) { return 0; }\n"}
+    sizes = {}
+    for name, text in programs.items():
+        main = folder / f"{name}.c"
+        main.write_text(text, encoding="utf-8")
+        elf = folder / f"{name}.elf"
+        link = ["--specs=nosys.specs", "-Wl,--gc-sections", str(main), "-o", str(elf), "-lm"]
+        subprocess.run([*run, "-DTBC_SINGLE", "-DTBC_LOW_LEVEL_ONLY", *link], check=True, capture_output=True)
+        sizes[name] = _sections(elf)[0]
+    return sizes["full"] - sizes["empty"]
+
+
+def _sections(path: Path) -> tuple[int, int, int]:
+    """Bytes of text, data and bss."""
+    output = subprocess.run(["arm-none-eabi-size", str(path)], check=True, capture_output=True, text=True).stdout
+    text, data, bss = output.splitlines()[1].split()[:3]
+    return int(text), int(data), int(bss)
+
+
+def _macro(path: Path, name: str) -> str:
+    found = re.search(rf"#define {name} (\S+)", path.read_text(encoding="utf-8"))
+    if found is None:
+        raise ConfigError(f"{path} was not written by this version of the exporter: no {name}")
+    return found.group(1)

@@ -1,0 +1,94 @@
+"""``python -m sb3_tbc.export``: the whole two-level policy as ONNX, one C99 file, or a NumPy-only module."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+from sb3_tbc.commands import Parser, positive_int, run_command
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.export.policy import MLP, Circuit, ExportedPolicy, extract
+from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.zoo.algorithms import load_two_levels
+
+SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
+
+
+def build_parser() -> Parser:
+    """The command's arguments."""
+    parser = Parser("sb3_tbc.export", description=__doc__)
+    parser.add_argument("model", type=Path, metavar="MODEL.zip")
+    parser.add_argument("--format", choices=sorted(SUFFIXES), required=True)
+    parser.add_argument("--output", type=Path, help="by default beside the model, with the format's suffix")
+    parser.add_argument("--check", type=positive_int, metavar="STEPS", help="play this many steps beside the agent")
+    parser.add_argument("--env", help="where to play; by default the task the agent was trained on")
+    parser.add_argument("--seed", type=int, default=0, help="of the episodes played")
+    return parser
+
+
+def write_onnx(policy: ExportedPolicy, path: Path) -> None:
+    """Write the policy as an ONNX graph.
+
+    :raises ConfigError: if onnx is not installed
+    """
+    if find_spec("onnx") is None:
+        raise ConfigError("writing ONNX needs the onnx package: pip install onnx onnxruntime")
+    import onnx
+
+    from sb3_tbc.export.onnx_graph import to_onnx
+
+    model = to_onnx(policy)
+    save_atomic(lambda temporary: onnx.save(model, temporary), path)
+
+
+def write_c(policy: ExportedPolicy, path: Path) -> None:
+    """Write the policy as one C99 file."""
+    from sb3_tbc.export.c99 import to_c
+
+    write_atomic(path, to_c(policy))
+
+
+def write_numpy(policy: ExportedPolicy, path: Path) -> None:
+    """Write the policy as a Python module that needs NumPy alone."""
+    from sb3_tbc.export.numpy_module import to_numpy_module
+
+    write_atomic(path, to_numpy_module(policy))
+
+
+WRITERS: dict[str, Callable[[ExportedPolicy, Path], None]] = {"onnx": write_onnx, "c": write_c, "numpy": write_numpy}
+
+
+def describe(policy: ExportedPolicy) -> str:
+    """One line about what was exported."""
+    low = policy.low
+    kind = "MLP" if isinstance(low, MLP) else f"circuit of {low.n_neurons} neurons, K = {low.sub_steps}"
+    return f"{policy.task}: {policy.n_observation} observations, {len(policy.action_low)} actions, low level {kind}"
+
+
+def command(argv: Sequence[str]) -> int:
+    """Export; see ``--help``."""
+    args = build_parser().parse_args(argv)
+    model = load_two_levels(args.model)
+    path = args.output or args.model.with_suffix(SUFFIXES[args.format])
+    policy = extract(model, args.model.stem)
+    WRITERS[args.format](policy, path)
+    print(f"{describe(policy)}\nwritten: {path}")
+    if args.format == "c":
+        from sb3_tbc.export.check import cortex_m4_report
+
+        print(cortex_m4_report(path))
+    if args.check is not None:
+        from sb3_tbc.evaluate import identify
+        from sb3_tbc.export.check import check
+
+        info = identify(args.model, args.env)
+        print(check(model, policy, args.format, path, info, args.check, args.seed))
+    elif isinstance(policy.low, Circuit) and args.format != "onnx":
+        print("closed form: not compared with the agent; measure it before you use it, with --check STEPS")
+    return 0
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    return run_command(command, "sb3_tbc.export", argv)

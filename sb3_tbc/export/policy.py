@@ -1,0 +1,315 @@
+"""A trained two-level policy as plain numbers: what every export format is written from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from torch import nn
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.level.policies import MLPActor, NDBCActor
+from sb3_tbc.ndbc.dissipative import DissipativeCell
+from sb3_tbc.ndbc.network import NDBCNet
+from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.scheduling import ReachRule
+
+FloatArray = NDArray[np.floating[Any]]
+ACTIVATIONS = {nn.ReLU: "relu", nn.Tanh: "tanh"}
+
+
+class Coordinate(NamedTuple):
+    """One coordinate of a state's subgoal-space point, computed from (observation, achieved goal) laid end to end.
+
+    ``kind``: ``"clip"``: entry ``first`` clipped to [low, high]; ``"wrap"``: the remainder of entry ``first`` by
+    ``high``, with its sign, as C's fmod; ``"angle"``: atan2 of entries ``first`` and ``second``.
+    """
+
+    kind: str
+    first: int
+    second: int = 0
+    low: float = -np.inf
+    high: float = np.inf
+
+    def __call__(self, entries: FloatArray) -> FloatArray:
+        """The coordinate for entries ``(..., n)``."""
+        value = entries[..., self.first]
+        if self.kind == "angle":
+            return np.asarray(np.arctan2(value, entries[..., self.second]))
+        if self.kind == "wrap":
+            return np.asarray(np.fmod(value, self.high))
+        return np.asarray(np.clip(value, self.low, self.high))
+
+
+@dataclass(frozen=True)
+class MLP:
+    """A feed-forward actor: hidden layers with one activation, then the mean."""
+
+    weights: tuple[FloatArray, ...]  # (inputs, outputs) each
+    biases: tuple[FloatArray, ...]
+    activation: str
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """An NDBC circuit with the conductance cell's derived arrays; see :class:`~sb3_tbc.ndbc.cell.ConductanceArrays`."""
+
+    sub_steps: int
+    order: tuple[tuple[int, ...], ...]  # in which the closed form takes the neurons, group after group
+    input_gain: FloatArray
+    sensory_gain: FloatArray
+    sensory_threshold: FloatArray
+    current_weight: FloatArray  # (I, M)
+    current_bias: FloatArray
+    from_inputs: FloatArray  # (I + M, 2 N)
+    recurrent: FloatArray  # (P, 2 N)
+    rest: FloatArray  # (2 N,)
+    capacitance: FloatArray
+    gain: FloatArray
+    threshold: FloatArray
+    readout: FloatArray  # (N, actions): means only
+    readout_bias: FloatArray
+
+    @property
+    def n_neurons(self) -> int:
+        """Neurons with a membrane potential."""
+        return len(self.capacitance)
+
+
+@dataclass(frozen=True)
+class Dissipative:
+    """A dissipative circuit, ``x <- shrink (x + eta tanh(W u + U x + b))``; U as the certificate leaves it."""
+
+    sub_steps: int
+    eta: float  # length of a sub-step
+    input_weight: FloatArray  # (I, N)
+    bias: FloatArray
+    recurrent: FloatArray  # (N, N)
+    shrink: FloatArray  # diagonal of (I + eta K)^-1
+    readout: FloatArray  # (N, actions): means only
+    readout_bias: FloatArray
+
+    @property
+    def n_neurons(self) -> int:
+        """Neurons with a state."""
+        return len(self.bias)
+
+
+@dataclass(frozen=True)
+class ExportedPolicy:
+    """Both levels' deterministic actors, and how an option begins and ends."""
+
+    task: str
+    n_observation: int
+    n_achieved: int
+    n_desired: int
+    high: MLP
+    low: MLP | Circuit | Dissipative
+    mean_bounds: tuple[float, float]  # high, low; infinite if there is none
+    local: tuple[int, ...]  # entries of (observation, achieved goal)
+    achieved: tuple[Coordinate, ...]  # empty if no option ends on reaching its subgoal
+    subgoal_low: FloatArray
+    subgoal_high: FloatArray
+    thresholds: FloatArray
+    groups: tuple[tuple[int, ...], ...]
+    dt_min: float
+    dt_max: float
+    window_end: str
+    event: int | None  # entry of the observation whose flag ends an option
+    memory: str
+    achieved_in_observation: bool
+    relative_subgoals: bool
+    remaining_time: bool  # whether the low level sees it
+    fixed_budget: float | None  # steps of every window where the high level does not choose them
+    action_low: FloatArray
+    action_high: FloatArray
+
+    @property
+    def state_dim(self) -> int:
+        """Membrane potentials; 0 for an MLP low level."""
+        return 0 if isinstance(self.low, MLP) else self.low.n_neurons
+
+    @property
+    def subgoal_dim(self) -> int:
+        """Number of subgoal coordinates."""
+        return len(self.subgoal_low)
+
+    @property
+    def n_low_inputs(self) -> int:
+        """Entries of the low level's observation: local state, subgoal, remaining time."""
+        return len(self.local) + self.subgoal_dim + int(self.remaining_time)
+
+    def plain(self) -> dict[str, Any]:
+        """All fields as dictionaries, numbers and arrays."""
+        return asdict(self)
+
+
+def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
+    """Read everything the deterministic policy needs from a model.
+
+    :param model: a trained agent
+    :param task: name, for file names and comments
+    :raises ConfigError: if something in the model has no exported form, saying what
+    """
+    layout, rules, subgoals = model.layout, model.rules, model.layout.subgoals
+    if isinstance(model.schedule, ReachRule):
+        raise ConfigError("an agent with duration='rule' cannot be exported: its windows come from another network")
+    unit_time = None if model.schedule is None else model.schedule.unit
+    sizes = {f"n_{key}": _width(model, name) for key, name in GOAL_PARTS.items()}
+    probe = _Probe(sizes["n_observation"], sizes["n_achieved"])
+    needed = rules.window_end == "reached" or layout.relative_subgoals
+    high, low = model.high.policy.average_actor, model.low.policy.average_actor
+    if isinstance(high, NDBCActor):
+        raise ConfigError("only the low level can be a circuit")
+    actions: Any = model.action_space
+    return ExportedPolicy(
+        task=task,
+        high=_read_mlp(high),
+        low=read_circuit(low.net, _actions(low)) if isinstance(low, NDBCActor) else _read_mlp(low),
+        mean_bounds=(_bound(high), _bound(low)),
+        local=probe.selection(subgoals.local),
+        achieved=probe.coordinates(subgoals.achieved) if needed else (),
+        subgoal_low=subgoals.low,
+        subgoal_high=subgoals.high,
+        thresholds=subgoals.thresholds,
+        groups=subgoals.groups,
+        dt_min=float(rules.dt_min),
+        dt_max=float(rules.dt_max),
+        window_end=rules.window_end,
+        event=subgoals.event,
+        memory=model.memory,
+        achieved_in_observation=layout.achieved_in_observation,
+        relative_subgoals=layout.relative_subgoals,
+        remaining_time=layout.remaining_time,
+        fixed_budget=None if unit_time is None else float(rules.budget(np.array(unit_time))),
+        action_low=actions.low.astype(np.float64),
+        action_high=actions.high.astype(np.float64),
+        **sizes,
+    )
+
+
+GOAL_PARTS = {"observation": "observation", "achieved": "achieved_goal", "desired": "desired_goal"}
+
+
+def _width(model: TBCHRL, key: str) -> int:
+    space: Any = model.observation_space
+    return int(space[key].shape[0])
+
+
+def _actions(actor: MLPActor | NDBCActor) -> int:
+    return int(np.prod(actor.action_space.shape))
+
+
+def _bound(actor: MLPActor | NDBCActor) -> float:
+    return np.inf if actor.head.mean_bound is None else float(actor.head.mean_bound)
+
+
+def _read_mlp(actor: MLPActor) -> MLP:
+    if actor.activation_fn not in ACTIVATIONS:
+        allowed = ", ".join(ACTIVATIONS.values())
+        raise ConfigError(f"only networks with {allowed} can be exported, this one has {actor.activation_fn.__name__}")
+    layers = [m for m in actor.latent_pi.modules() if isinstance(m, nn.Linear)] + [actor.mu]
+    weights = tuple(_numpy(layer.weight).T.copy() for layer in layers)  # type: ignore[arg-type]
+    return MLP(weights, tuple(_numpy(layer.bias) for layer in layers), ACTIVATIONS[actor.activation_fn])  # type: ignore[arg-type]
+
+
+@th.no_grad()
+def read_circuit(net: NDBCNet, n_actions: int) -> Circuit | Dissipative:
+    """The numbers of a network whose first ``n_actions`` outputs are the means.
+
+    :raises ConfigError: for networks with half-step checks
+    """
+    if net.step_rule is not None and net.step_rule.half_step_check:
+        raise ConfigError("a circuit with half_step_check cannot be exported: its work varies from step to step")
+    cell, wiring = net.cell, net.wiring
+    readout = np.zeros((wiring.n_neurons, n_actions), np.float32)
+    readout[net.read_from :] = _numpy(net.readout_weight)[:n_actions].T
+    if isinstance(cell, DissipativeCell):
+        arrays = cell.arrays()
+        eta = cell.pace(arrays, 1.0 / net.sub_steps)
+        return Dissipative(
+            net.sub_steps, float(eta[0]), _numpy(net.input_gain.unsqueeze(-1) * arrays.input_weight), _numpy(cell.bias),
+            _numpy(cell.enforced(arrays, eta)), _numpy(1.0 / (1.0 + eta * arrays.damping)),
+            readout, _numpy(net.readout_bias)[:n_actions],
+        )  # fmt: skip
+    a = cell.arrays()
+    return Circuit(
+        net.sub_steps, wiring.relaxation_order(), _numpy(net.input_gain), _numpy(a.sensory_gain),
+        _numpy(cell.sensory_threshold), _numpy(a.current_weight), _numpy(cell.current_bias), _numpy(a.from_inputs),
+        _numpy(a.recurrent), _numpy(a.rest), _numpy(a.capacitance), _numpy(a.gain), _numpy(cell.threshold),
+        readout, _numpy(net.readout_bias)[:n_actions],
+    )  # fmt: skip
+
+
+def _numpy(tensor: th.Tensor) -> NDArray[np.float32]:
+    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32).copy()
+
+
+class _Probe:
+    """Finds out how a task computes its local state and subgoal-space point, by asking it about many observations.
+
+    Tasks give these as Python functions. In practice every entry is picked from the observation, some clipped, wrapped
+    or turned into an angle; what is found is checked on further observations, and anything else is refused.
+    """
+
+    def __init__(self, n_observation: int, n_achieved: int) -> None:
+        self.split, self.n = n_observation, n_observation + n_achieved
+        self.rng = np.random.default_rng(0)
+
+    def _ask(self, function: Callable[[Any], FloatArray], entries: FloatArray) -> FloatArray:
+        observation, achieved = entries[..., : self.split], entries[..., self.split :]
+        answer = function({"observation": observation, "achieved_goal": achieved, "desired_goal": achieved})
+        return np.asarray(answer, dtype=np.float64)
+
+    def selection(self, function: Callable[[Any], FloatArray]) -> tuple[int, ...]:
+        """Which entry each coordinate is.
+
+        :raises ConfigError: if some coordinate is not simply an entry
+        """
+        found = self.coordinates(function)
+        for i, c in enumerate(found):
+            if c.kind != "clip" or np.isfinite(c.low) or np.isfinite(c.high):
+                raise ConfigError(f"entry {i} of the local state is not an entry of the observation: cannot export")
+        return tuple(c.first for c in found)
+
+    def coordinates(self, function: Callable[[Any], FloatArray]) -> tuple[Coordinate, ...]:
+        """A formula for each coordinate.
+
+        :raises ConfigError: if some coordinate has none of the known forms
+        """
+        base = self.rng.normal(size=(8, self.n))
+        values = self._ask(function, base)
+        depends = np.zeros((values.shape[1], self.n), dtype=bool)
+        for entry in range(self.n):
+            moved = base.copy()
+            moved[:, entry] = self.rng.normal(size=len(base))
+            depends[:, entry] = (self._ask(function, moved) != values).any(axis=0)
+        tests = self.rng.normal(size=(400, self.n)) * np.logspace(-2, 3, 400)[:, None]
+        answers = self._ask(function, tests)
+        far = self._ask(function, np.array([[-1e9], [1e9]]) * np.ones(self.n))
+        return tuple(
+            self._formula(i, np.flatnonzero(depends[i]).tolist(), far[:, i], tests, answers[:, i])
+            for i in range(values.shape[1])
+        )
+
+    def _formula(
+        self, index: int, entries: list[int], far: FloatArray, tests: FloatArray, answers: FloatArray
+    ) -> Coordinate:
+        candidates = []
+        if len(entries) == 1:
+            low, high = (-np.inf if far[0] == -1e9 else far[0]), (np.inf if far[1] == 1e9 else far[1])
+            candidates = [Coordinate("clip", entries[0], 0, float(low), float(high))]
+            candidates += [Coordinate("wrap", entries[0], 0, -np.inf, 2 * np.pi)]
+        elif len(entries) == 2:
+            candidates = [Coordinate("angle", *pair) for pair in (entries, entries[::-1])]
+        for candidate in candidates:
+            if np.allclose(candidate(tests), answers, rtol=1e-9, atol=1e-12):
+                return candidate
+        raise ConfigError(
+            f"subgoal coordinate {index} depends on entries {entries} of the observation in a way that has no exported "
+            "form (known: an entry, clipped, wrapped to a turn, or the angle of two entries)"
+        )

@@ -1,0 +1,1 @@
+"""One level of the hierarchy: SB3's SAC, updated on flat storage, acting in NumPy."""

@@ -1,0 +1,168 @@
+"""Acting from the current weights in NumPy: at batch 1 a torch forward pass is mostly overhead."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import nn
+
+from sb3_tbc.level.policies import Block, GaussianHead, LevelPolicy, MLPActor, NDBCActor
+
+FloatArray = NDArray[np.floating[Any]]
+"""float32 in all that is given and returned here."""
+
+
+def _relu(x: FloatArray) -> FloatArray:
+    np.maximum(x, 0.0, out=x)
+    return x
+
+
+def _silu(x: FloatArray) -> FloatArray:
+    return np.asarray(x * (0.5 + 0.5 * np.tanh(0.5 * x)))
+
+
+def _elu(x: FloatArray) -> FloatArray:
+    return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
+
+
+ACTIVATIONS: dict[type[nn.Module], Callable[[Any], Any]] = {
+    nn.ReLU: _relu,
+    nn.Tanh: np.tanh,
+    nn.SiLU: _silu,
+    nn.ELU: _elu,
+}
+
+
+class FrozenNet(Protocol):
+    """A network's outputs and next state for one control step, in NumPy."""
+
+    def __call__(self, inputs: FloatArray, state: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        """Outputs ``(n, 2 * action_dim)`` and next states ``(n, state_dim)``."""
+
+    def refresh(self) -> None:
+        """Read the weights again after they changed."""
+
+
+class FrozenMLP:
+    """NumPy forward pass of an MLP actor.
+
+    In single precision its arrays share memory with the parameters, so it is never stale.
+
+    :param actor: the actor
+    :param dtype: precision of the arithmetic; inputs and outputs are float32
+    :raises ValueError: for an activation function without a NumPy counterpart
+    """
+
+    def __init__(self, actor: MLPActor, dtype: type[np.floating[Any]] = np.float32) -> None:
+        if actor.activation_fn not in ACTIVATIONS:
+            allowed = sorted(f.__name__ for f in ACTIVATIONS)
+            raise ValueError(f"activation_fn must be one of {allowed} to act in NumPy, got {actor.activation_fn}")
+        self._actor, self._dtype = actor, dtype
+        self._activation = ACTIVATIONS[actor.activation_fn]
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Point the arrays at the parameters again, or copy them in another precision."""
+        arrays = [_as_array(block).astype(self._dtype, copy=False) for block in self._actor.blocks()]
+        self._hidden = [(w.T, b) for w, b in zip(arrays[:-2:2], arrays[1:-2:2], strict=True)]
+        self._out_weight, self._out_bias = arrays[-2].T, arrays[-1]
+
+    def __call__(self, observations: FloatArray, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Outputs ``(n, 2 * action_dim)`` before the head's bounds, and the empty states."""
+        x = observations
+        activation = self._activation
+        for weight, bias in self._hidden:
+            x = np.dot(x, weight)
+            x += bias
+            x = activation(x)
+        outputs = np.dot(x, self._out_weight) + self._out_bias
+        return outputs.astype(np.float32, copy=False), states
+
+
+def _as_array(block: Block) -> FloatArray:
+    """A block of at most two dimensions as one array, without a copy if its parameters lie in flat storage."""
+    first = block.parameters[0].detach()
+    end = first.data_ptr()
+    for parameter in block.parameters:
+        if parameter.data_ptr() != end:  # a copied policy, not yet in flat storage
+            return np.concatenate([p.detach().numpy() for p in block.parameters])
+        end += parameter.numel() * parameter.element_size()
+    strides = (block.shape[1], 1) if len(block.shape) == 2 else (1,)
+    return first.as_strided(block.shape, strides).numpy()
+
+
+def freeze(actor: MLPActor | NDBCActor, dtype: type[np.floating[Any]] = np.float32) -> FrozenNet:
+    """NumPy forward pass of an actor whose parameters lie in flat storage.
+
+    :param dtype: precision of an MLP's arithmetic; a circuit's is double in any case
+    """
+    if isinstance(actor, NDBCActor):
+        from sb3_tbc.ndbc.frozen import FrozenNDBC
+
+        return FrozenNDBC(actor.net)
+    return FrozenMLP(actor, dtype)
+
+
+class FrozenActor:
+    """Acts in NumPy from an actor's weights, which it reads again when the policy's ``weights_version`` has changed.
+
+    The averaged actor, which is what gets deployed, acts in double precision inside: what it is given and what it
+    returns is rounded to single precision, and an exported policy that does the same gives the same actions.
+
+    :param policy: policy of a level, its parameters in flat storage
+    :param average: act from the averaged actor
+    """
+
+    def __init__(self, policy: LevelPolicy, average: bool) -> None:
+        actor = policy.average_actor if average else policy.actor
+        self._policy = policy
+        self._version = policy.weights_version
+        self._dtype = np.float64 if average else np.float32
+        self._net = freeze(actor, self._dtype)
+        head: GaussianHead = actor.head
+        self._dim = int(np.prod(actor.action_space.shape))
+        mean_bound = np.inf if head.mean_bound is None else head.mean_bound
+        low, high = head.log_std_bounds
+        self._lowest, self._highest = (
+            np.repeat(np.array(pair, dtype=np.float32), self._dim) for pair in ((-mean_bound, low), (mean_bound, high))
+        )
+
+    def act(
+        self,
+        observations: FloatArray,
+        states: FloatArray,
+        deterministic: bool | NDArray[np.bool_],
+        rng: np.random.Generator,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``.
+
+        :param observations: ``(n, observation_dim)`` float32
+        :param states: ``(n, state_dim)`` float32
+        :param deterministic: the squashed mean instead of a sample, for all rows or for those of a mask ``(n,)``
+        :param rng: source of the noise
+        """
+        outputs, next_states = self._current()(observations, states)
+        dim = self._dim
+        bounded = np.minimum(np.maximum(outputs, self._lowest), self._highest)
+        chosen = bounded[:, :dim]
+        if deterministic is not True:
+            noise = np.exp(bounded[:, dim:])
+            noise *= rng.standard_normal(chosen.shape, dtype=np.float32)
+            if deterministic is not False:
+                noise[deterministic] = 0.0
+            noise += chosen
+            chosen = noise
+        return np.tanh(chosen, dtype=self._dtype).astype(np.float32, copy=False), next_states
+
+    def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
+        """States ``(n, state_dim)`` after a step with these observations."""
+        return self._current()(observations, states)[1]
+
+    def _current(self) -> FrozenNet:
+        if self._version != self._policy.weights_version:
+            self._net.refresh()
+            self._version = self._policy.weights_version
+        return self._net

@@ -1,0 +1,243 @@
+"""One level of the hierarchy: SB3's SAC on spaces alone, fed from outside, updated on flat storage, acting in NumPy."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Protocol
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule
+from torch import nn
+
+from sb3_tbc.errors import HierarchyError, NonFiniteError
+from sb3_tbc.level.acting import FrozenActor
+from sb3_tbc.level.policies import LevelPolicy
+from sb3_tbc.level.spaces_only import SpacesOnlyVecEnv
+from sb3_tbc.level.update import AVERAGE_DECAY, SACUpdate
+from sb3_tbc.replay.batch import LevelBatch
+
+FloatArray = NDArray[np.floating[Any]]
+
+BURST_ROWS = 32_768
+"""Transitions that are gathered at once, for several updates; many more no longer fit the caches."""
+
+
+class BurstBuffer(Protocol):
+    """What a level asks of its replay buffer."""
+
+    def sample_burst(self, gradient_steps: int, batch_size: int) -> LevelBatch:
+        """Sample tensors ``(gradient_steps, batch_size, ...)``."""
+
+
+class SACLevel(SAC):
+    """SAC for one level. It neither collects nor stores: ``replay_buffer`` is filled by whoever owns the level.
+
+    :param policy: policy class, by default :class:`LevelPolicy`
+    :param observation_space: flat observations of the level
+    :param action_space: the level's actions, unit coordinates
+    :param replay_buffer: gives :class:`LevelBatch` bursts; may be set later
+    :param ent_coef_learning_rate: of the automatic temperature, by default the schedule ``learning_rate``
+    :param actor_learning_rate: of the actor, by default ``learning_rate``; circuits take larger steps than critics
+    :param compile: "auto" (compiled if there is a C++ compiler), True or False (eager)
+    :param name: names the level in messages and logs (``low/critic_loss``)
+    :param label_coef: weight of a regression of the last action coordinate toward labels of the replay buffer in the
+        actor's loss (the paper's duration loss); if positive, batches come from ``replay_buffer.sample_labelled``
+    :param average_decay: decay per update of the averaged actor, which acts where deterministic actions are asked for
+
+    Other parameters are SB3's; ``policy_kwargs`` are :class:`LevelPolicy`'s.
+    """
+
+    policy: LevelPolicy
+
+    def __init__(
+        self,
+        policy: type[LevelPolicy] | str,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        replay_buffer: BurstBuffer | None = None,
+        learning_rate: float | Schedule = 3e-4,
+        gamma: float = 0.99,
+        tau: float = 0.005,
+        ent_coef: str | float = "auto",
+        target_entropy: str | float = "auto",
+        policy_kwargs: dict[str, Any] | None = None,
+        seed: int | None = None,
+        device: th.device | str = "cpu",
+        compile: bool | str = "auto",
+        ent_coef_learning_rate: float | None = None,
+        actor_learning_rate: float | Schedule | None = None,
+        name: str = "level",
+        label_coef: float = 0.0,
+        average_decay: float = AVERAGE_DECAY,
+    ) -> None:
+        super().__init__(
+            LevelPolicy if isinstance(policy, str) else policy,
+            SpacesOnlyVecEnv(observation_space, action_space),
+            learning_rate=learning_rate,
+            buffer_size=1,
+            gamma=gamma,
+            tau=tau,
+            ent_coef=ent_coef,
+            target_entropy=target_entropy,
+            policy_kwargs=dict(policy_kwargs or {}),
+            seed=seed,
+            device="cpu" if device == "auto" else device,
+            _init_setup_model=False,
+        )
+        self.compile = compile
+        self.ent_coef_learning_rate = ent_coef_learning_rate
+        self.actor_lr_schedule = None if actor_learning_rate is None else FloatSchedule(actor_learning_rate)
+        self.log_prefix = f"{name}/"
+        self.label_coef, self.average_decay = label_coef, average_decay
+        self.set_logger(Logger(folder=None, output_formats=[]))
+        self._setup_model()
+        self.replay_buffer = replay_buffer  # type: ignore[assignment]
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+            zeros = {"exp_avg": th.zeros(1), "exp_avg_sq": th.zeros(1)}
+            self.ent_coef_optimizer.state[self.log_ent_coef] = {"step": th.tensor(0.0), **zeros}
+        self.noise_rng = np.random.default_rng(self.seed)
+        self._update = SACUpdate(
+            self.policy, self.ent_coef_optimizer, self.compile, self.label_coef, self.average_decay
+        )
+        self._frozen = {average: FrozenActor(self.policy, average) for average in (False, True)}
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_update", "_frozen"]
+
+    def attach(self, replay_buffer: BurstBuffer) -> None:
+        """Learn from this replay buffer from now on."""
+        self.replay_buffer = replay_buffer  # type: ignore[assignment]
+
+    @property
+    def state_dim(self) -> int:
+        """Width of the actor's state, 0 for an MLP."""
+        return self.policy.actor.state_dim
+
+    @property
+    def compiled(self) -> bool:
+        """Whether the last updates ran as a compiled graph."""
+        return self._update.compiled
+
+    def train(self, gradient_steps: int, batch_size: int = 256) -> None:
+        """Sample ``gradient_steps`` batches and update on each.
+
+        :raises HierarchyError: without a replay buffer
+        :raises NonFiniteError: if a parameter became NaN or infinite
+        """
+        if self.replay_buffer is None:
+            raise HierarchyError(f"{self.log_prefix[:-1]} has no replay buffer; set its replay_buffer before train")
+        self.policy.set_training_mode(True)
+        self._set_learning_rates()
+        sums: dict[str, float] = {}
+        burst = max(1, BURST_ROWS // batch_size)
+        for start in range(0, gradient_steps, burst):
+            steps = min(burst, gradient_steps - start)
+            for key, value in self._run(steps, batch_size).items():
+                sums[key] = sums.get(key, 0.0) + steps * value
+            self.policy.after_updates(steps)
+        self._n_updates += gradient_steps
+        self._check_finite()
+        for key, total in sums.items():
+            self.logger.record(self.log_prefix + key, total / gradient_steps)
+        self.logger.record(self.log_prefix + "n_updates", self._n_updates, exclude="tensorboard")
+
+    def _run(self, gradient_steps: int, batch_size: int) -> dict[str, float]:
+        buffer: Any = self.replay_buffer
+        labels: th.Tensor | None = None
+        if self.label_coef:
+            batch, labels = buffer.sample_labelled(gradient_steps, batch_size)
+        else:
+            batch = buffer.sample_burst(gradient_steps, batch_size)
+        shape = (gradient_steps, 2, batch.rewards.shape[1], self._update.action_dim)
+        noise = th.from_numpy(self.noise_rng.standard_normal(shape, dtype=np.float32))
+        return self._update.run(
+            batch,
+            noise,
+            tau=self.tau,
+            target_entropy=float(self.target_entropy),
+            ent_coef=self._ent_coef_state(),
+            labels=labels,
+        )
+
+    def _ent_coef_state(self) -> th.Tensor:
+        return self.ent_coef_tensor if self.log_ent_coef is None else self.log_ent_coef
+
+    def prepare(self, batch_size: int, compile: bool | str | None = None) -> float:
+        """Compile the update for a batch size now rather than in the first :meth:`train`.
+
+        :param compile: changes how updates run from now on; by default as the level was made
+        :return: seconds it took
+        """
+        start = time.perf_counter()
+        self._update.choose(self.compile if compile is None else compile)
+        self._update.prepare(batch_size, self._ent_coef_state())
+        return time.perf_counter() - start
+
+    def _set_learning_rates(self) -> None:
+        learning_rate = self.lr_schedule(self._current_progress_remaining)
+        for optimizer in self._update.optimizers():
+            optimizer.param_groups[0]["lr"] = learning_rate
+        if self.actor_lr_schedule is not None:
+            actor_learning_rate = self.actor_lr_schedule(self._current_progress_remaining)
+            self.policy.actor.optimizer.param_groups[0]["lr"] = actor_learning_rate
+            self.logger.record(self.log_prefix + "actor_learning_rate", actor_learning_rate)
+        if self.ent_coef_optimizer is not None and self.ent_coef_learning_rate is not None:
+            self.ent_coef_optimizer.param_groups[0]["lr"] = self.ent_coef_learning_rate
+        self.logger.record(self.log_prefix + "learning_rate", learning_rate)
+
+    def _check_finite(self) -> None:
+        vectors: dict[str, th.Tensor] = {"critic": self._update.critic.vector, "actor": self._update.actor.vector}
+        if self.log_ent_coef is not None:
+            vectors["log_ent_coef"] = self.log_ent_coef
+        for module, vector in vectors.items():
+            if not th.isfinite(vector.detach().sum()):
+                raise NonFiniteError(self._describe_non_finite(module))
+
+    def _describe_non_finite(self, module: str) -> str:
+        """Name the first parameter of a module that is not finite."""
+        name = module
+        network: nn.Module | None = getattr(self.policy, module, None)
+        for key, parameter in network.named_parameters() if network is not None else ():
+            if not th.isfinite(parameter).all():
+                name = f"{module}.{key}"
+                break
+        return (
+            f"{self.log_prefix[:-1]}.{name} became NaN or infinite within the burst that ended at update"
+            f" {self._n_updates}; a lower learning rate or rewards of smaller scale usually cure it"
+        )
+
+    def refresh(self) -> None:
+        """Make the next :meth:`act` read the weights again; needed after changing them by hand."""
+        self.policy.after_updates(0)
+
+    def act(
+        self,
+        observations: FloatArray,
+        states: FloatArray,
+        deterministic: bool | NDArray[np.bool_],
+        rng: np.random.Generator,
+        average: bool = False,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Act in NumPy from the current weights.
+
+        :param observations: ``(n, observation_dim)`` float32
+        :param states: ``(n, state_dim)`` float32, zeros at the start of a window
+        :param deterministic: the squashed mean instead of a sample, for all rows or for those of a mask ``(n,)``
+        :param rng: source of the noise
+        :param average: act from the averaged actor
+        :return: unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``
+        """
+        return self._frozen[average].act(observations, states, deterministic, rng)
+
+    def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
+        """Memory states ``(n, state_dim)`` after a step with these observations, from the current weights."""
+        return self._frozen[False].advance(observations, states)

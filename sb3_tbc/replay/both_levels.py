@@ -1,0 +1,44 @@
+"""The replay buffers of both levels as one, and their file of plain arrays."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.files import write_arrays
+from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
+
+MORE = "running"
+"""Prefix of arrays in the file that belong to neither buffer."""
+
+
+class Replay(NamedTuple):
+    """The replay buffers of both levels."""
+
+    high: OptionReplayBuffer
+    low: SubgoalReplayBuffer
+
+    def save(self, path: str | pathlib.Path | io.BufferedIOBase, more: Mapping[str, NDArray[Any]]) -> None:
+        """Write both buffers to one file of plain arrays, atomically.
+
+        :param more: arrays to write into the same file
+        """
+        states = {name: buffer.get_state() for name, buffer in self._asdict().items()} | {MORE: more}
+        write_arrays(path, {f"{name}.{key}": x for name, state in states.items() for key, x in state.items()})
+
+    def load(self, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, NDArray[Any]]:
+        """Read what :meth:`save` wrote; only plain arrays are read, never pickled objects.
+
+        :return: the further arrays of the file
+        :raises ValueError: if the file was written for other spaces or sizes
+        """
+        with np.load(path, allow_pickle=False) as arrays:
+            for name, buffer in self._asdict().items():
+                names = [key for key in arrays.files if key.startswith(f"{name}.")]
+                buffer.set_state({key.removeprefix(f"{name}."): arrays[key] for key in names})
+            return {k.removeprefix(f"{MORE}."): arrays[k] for k in arrays.files if k.startswith(f"{MORE}.")}

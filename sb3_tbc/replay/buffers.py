@@ -1,0 +1,297 @@
+"""Replay buffers of the two levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sb3_tbc.errors import HierarchyError
+from sb3_tbc.replay.batch import LevelBatch
+from sb3_tbc.replay.ring import Float32, RingBuffer
+from sb3_tbc.smdp.hindsight import HighLevelSteps, LowLevelSteps, ordered_pairs
+from sb3_tbc.smdp.options import OptionRules
+from sb3_tbc.smdp.rewards import LowLevelReward
+from sb3_tbc.smdp.spaces import SubgoalSpace
+from sb3_tbc.smdp.views import LevelLayout
+
+Teacher = Callable[[Float32, Float32, Float32], Float32]
+"""Maps high-level observations, local states and subgoal-space points to unit time budgets to imitate, ``(n,)``."""
+
+Advance = Callable[[Float32, Float32], Float32]
+"""Maps low-level observations and memory states to the next states, from the current weights."""
+
+HINDSIGHT_SUBGOALS = ("timed", "future", "episode")
+MISS_SPREAD = 0.7
+"""Standard deviation of a near miss, in thresholds: with six coordinates four of ten are still hits."""
+
+
+class ReachPairs(NamedTuple):
+    """Visited states and points visited later in the same episode."""
+
+    local: Float32  # (n, local_dim), what the low level saw
+    here: Float32  # (n, subgoal_dim), where it was
+    goal: Float32  # (n, subgoal_dim), where it was later
+    steps: Float32  # (n,), how many steps later it first was there
+
+
+class OptionReplayBuffer(RingBuffer):
+    """The high level's SMDP transitions; ``discounts`` carries ``gamma ** duration`` (SB3 reads it per sample).
+
+    :param context: also keep what a teacher of time budgets needs of each option's first state
+    """
+
+    teacher: Teacher | None = None
+    """Gives the labels of :meth:`sample_labelled`."""
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        device: th.device | str = "cpu",
+        seed: int | None = None,
+        context: SubgoalSpace | None = None,
+    ) -> None:
+        observation, action = observation_space.shape[0], action_space.shape[0]
+        widths = {
+            "observations": observation,
+            "actions": action,
+            "next_observations": observation,
+            "rewards": 1,
+            "dones": 1,
+            "discounts": 1,
+        }
+        if context is not None:
+            widths |= {"local": context.local_dim, "here": context.dim}
+        super().__init__(buffer_size, observation_space, action_space, widths, device, seed)
+
+    def extend(self, steps: HighLevelSteps) -> None:
+        """Add the transitions of an episode; the time budget is left out where the level does not choose it."""
+        rows = {name: getattr(steps, name) for name in self.data}
+        self._extend({**rows, "actions": steps.actions[:, : self.action_dim]})
+
+    def sample_labelled(self, gradient_steps: int, batch_size: int) -> tuple[LevelBatch, th.Tensor]:
+        """As :meth:`sample_burst`, with the teacher's unit time budgets ``(gradient_steps, batch_size, 1)``.
+
+        :raises HierarchyError: without a teacher
+        """
+        if self.teacher is None:
+            raise HierarchyError("labelled samples need a teacher: set replay_buffer.teacher")
+        at = self.rng.integers(0, self.size(), gradient_steps * batch_size)
+        taken = self._take(at)
+        labels = self.teacher(*(taken[name] for name in ("observations", "local", "here")))
+        parts = [*self._batch(taken), np.asarray(labels, dtype=np.float32)]
+        shape = (gradient_steps, batch_size, -1)
+        *batch, labels_ = (th.from_numpy(part).view(shape).to(self.device) for part in parts)
+        return LevelBatch(*batch), labels_
+
+    def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
+        return self._batch(self._take(at))
+
+    @staticmethod
+    def _batch(taken: dict[str, Float32]) -> tuple[Float32, ...]:
+        no_state = np.zeros((len(taken["rewards"]), 0), dtype=np.float32)
+        return (*(taken[name] for name in LevelBatch._fields[:6]), no_state, no_state)
+
+
+class SubgoalReplayBuffer(RingBuffer):
+    """The low level's transitions, with hindsight subgoals drawn when sampling. Nothing is stored twice.
+
+    Of the samples, a share ``n / (n + 1)`` is relabelled. ``"timed"`` (HiTS): a step and a later-or-equal step of the
+    same window are drawn uniformly, the point reached at the later one becomes the subgoal, and the remaining time is
+    what was left until then (less a uniform fraction of a step, as time budgets are real-valued). ``"future"`` and
+    ``"episode"`` (HAC, which has no time): the point reached at a strictly later step of the window, or at any of
+    its steps; where fewer than n are there to draw from, the share falls accordingly.
+
+    A point that was reached is always a hit, so that relabelled samples alone never say what a miss is, and the value
+    of any action near a subgoal rises to that of a hit. A share ``near_misses`` of them is moved off the point by a
+    normally distributed distance and rewarded by the subgoal's own test, which shows the edge of a hit.
+
+    :param gamma: discount per environment step
+    :param n_hindsight_goals: n above, relabelled samples per plain one
+    :param near_misses: share of the relabelled samples whose subgoal is moved off the point that was reached
+    :param reward: the low level's reward, by default the sparse one
+    :param hindsight: ``"timed"``, ``"future"`` or ``"episode"``
+    :param sequence_length: with more than 1, memory states are not the stored ones but recomputed by :attr:`advance`
+        through up to ``sequence_length - 1`` preceding steps of the same window, under the sampled subgoal
+    :param reach_pairs: keep what :meth:`sample_pairs` needs
+    :raises ValueError: if ``hindsight`` is unknown or ``sequence_length`` not positive, or more than 1 without memory
+    """
+
+    advance: Advance | None = None
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        layout: LevelLayout,
+        rules: OptionRules,
+        state_dim: int,
+        gamma: float,
+        n_hindsight_goals: float,
+        near_misses: float = 0.0,
+        device: th.device | str = "cpu",
+        seed: int | None = None,
+        reward: LowLevelReward | None = None,
+        hindsight: str = "timed",
+        sequence_length: int = 1,
+        reach_pairs: bool = False,
+    ) -> None:
+        if hindsight not in HINDSIGHT_SUBGOALS:
+            raise ValueError(f"hindsight must be one of {', '.join(HINDSIGHT_SUBGOALS)}, got {hindsight!r}")
+        if sequence_length < 1:
+            raise ValueError(f"sequence_length must be at least 1 (no burn-in), got {sequence_length}")
+        if sequence_length > 1 and not state_dim:
+            raise ValueError(
+                f"sequence_length={sequence_length} recomputes the low level's memory, but it has none: use "
+                "sequence_length=1, or a circuit (low.policy_kwargs.ndbc)"
+            )
+        subgoals = layout.subgoals
+        widths = {
+            "local": subgoals.local_dim,
+            "next_local": subgoals.local_dim,
+            "actions": action_space.shape[0],
+            "states": state_dim,
+            "next_states": state_dim,
+            "subgoal": subgoals.dim,
+            "here": subgoals.dim,
+            "achieved": subgoals.dim,
+            "time_left": 1,
+            "position": 1,
+            "length": 1,
+            "rewards": 1,
+            "dones": 1,
+        }
+        if reach_pairs:
+            widths["to_end"] = 1
+        super().__init__(buffer_size, observation_space, action_space, widths, device, seed)
+        self.layout, self.rules, self.gamma = layout, rules, gamma
+        self.reward = reward or LowLevelReward("sparse", subgoals, rules)
+        self.hindsight, self.n_hindsight_goals, self.sequence_length = hindsight, n_hindsight_goals, sequence_length
+        self.near_misses, self._miss = near_misses, (MISS_SPREAD * subgoals.tolerance).astype(np.float32)
+
+    def extend(self, steps: LowLevelSteps) -> None:
+        """Add the transitions of an episode, in the order they happened."""
+        rows = steps._asdict()
+        if "to_end" in self.data:
+            rows["to_end"] = np.arange(len(steps.rewards), 0, -1)
+        self._extend(rows)
+
+    def sample_pairs(self, n: int, horizon: int, rng: np.random.Generator) -> ReachPairs:
+        """Uniformly drawn steps, and a uniformly drawn one of the up to ``horizon`` points reached from there on.
+
+        The label is the step at which that point was first reached, within the subgoal's thresholds: on a way that
+        comes back to a point, the later visits say nothing of how far it is.
+
+        :param rng: draws them, so that the sampling of transitions stays what it is without them
+        """
+        data = self.data
+        at = rng.integers(0, self.size(), n)
+        # how many rows were written after it, itself included: the ring's oldest rows follow its newest ones
+        written = self.buffer_size - (at - self.pos) % self.buffer_size if self.full else self.pos - at
+        ahead = np.minimum(data["to_end"][at, 0].astype(np.int64), written)
+        steps = rng.integers(0, np.minimum(ahead, horizon)) + 1
+        goal = data["achieved"][(at + steps - 1) % self.buffer_size]
+        way = data["achieved"][(at[:, None] + np.arange(steps.max())) % self.buffer_size]
+        first = self.layout.subgoals.reached(way, goal[:, None]).argmax(axis=1) + 1  # the goal itself is on the way
+        return ReachPairs(data["local"][at], data["here"][at], goal, first.astype(np.float32))
+
+    def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
+        at, where, second = self._timed(at) if self.hindsight == "timed" else self._untimed(at)
+        taken = self._take(at)
+        subgoal, time_left, rewards, dones = (taken[name] for name in ("subgoal", "time_left", "rewards", "dones"))
+        subgoal[where] = self._missed(self.data["achieved"][second])
+        expired = second == at[where]
+        if self.hindsight == "timed":
+            ahead = (second - at[where]) % self.buffer_size
+            time_left[where, 0] = ahead + 1 - self.rng.random(len(where), dtype=np.float32)
+        here, achieved = taken["here"], taken["achieved"]
+        rewards[where, 0], dones[where, 0] = self._relabelled(here[where], achieved[where], subgoal[where], expired)
+        scale = np.float32(1.0 / self.rules.dt_max)
+        now, later = (np.clip(t * scale, 0.0, 1.0) for t in (time_left, time_left - 1.0))
+        observations = self.layout.low_from(taken["local"], here, subgoal, now)
+        return (
+            observations,
+            taken["actions"],
+            self.layout.low_from(taken["next_local"], achieved, subgoal, later),
+            rewards,
+            dones,
+            np.full_like(rewards, self.gamma),
+            *self._states(at, taken, observations),
+        )
+
+    def _timed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Rows to sample, which of them are relabelled, and the rows whose outcome becomes their subgoal."""
+        share = self.n_hindsight_goals / (self.n_hindsight_goals + 1.0)
+        where = np.flatnonzero(self.rng.random(len(at)) < share)
+        position, length = (self.data[name][at[where], 0].astype(np.int64) for name in ("position", "length"))
+        first, second = ordered_pairs(length, self.rng)
+        begin = at[where] - position
+        # rows of a window may have been overwritten by newer ones or lie across the ring's end: keep those as they are
+        whole = self._intact(begin, length)
+        where, first, second, begin = where[whole], first[whole], second[whole], begin[whole]
+        at = at.copy()
+        at[where] = (begin + first) % self.buffer_size
+        return at, where, (begin + second) % self.buffer_size
+
+    def _missed(self, reached: Float32) -> Float32:
+        """Points that were reached, a share of them moved off."""
+        if self.near_misses:
+            moved = np.flatnonzero(self.rng.random(len(reached)) < self.near_misses)
+            reached[moved] += self._miss * self.rng.standard_normal((len(moved), reached.shape[1]), dtype=np.float32)
+        return reached
+
+    def _untimed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """The same for goals without time: the rows stay, only their subgoals are drawn."""
+        position, length = (self.data[name][at, 0].astype(np.int64) for name in ("position", "length"))
+        begin = at - position
+        start = position + 1 if self.hindsight == "future" else np.zeros_like(position)
+        copies = np.minimum(self.n_hindsight_goals, length - start)
+        chosen = (self.rng.random(len(at)) < copies / (copies + 1.0)) & self._intact(begin, length)
+        where = np.flatnonzero(chosen)
+        second = self.rng.integers(start[where], length[where])
+        return at, where, (begin[where] + second) % self.buffer_size
+
+    def _relabelled(
+        self, here: Float32, achieved: Float32, subgoal: Float32, expired: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+        """Rewards and ends of relabelled steps."""
+        if self.reward.kind == "sparse" and self.rules.window_end == "timed" and not self.near_misses:
+            return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
+        return self.reward.of(here, achieved, subgoal, expired)
+
+    def _states(
+        self, at: NDArray[np.int64], taken: dict[str, Float32], observations: Float32
+    ) -> tuple[Float32, Float32]:
+        """Memory states before and after the sampled steps: the stored ones, or recomputed by a burn-in.
+
+        :param taken: the sampled rows, with the subgoals and times that they are relabelled with
+        """
+        if self.sequence_length == 1 or self.advance is None:
+            return taken["states"], taken["next_states"]
+        position, length = (taken[name][:, 0].astype(np.int64) for name in ("position", "length"))
+        back = np.minimum(position, self.sequence_length - 1)
+        back[~self._intact(at - position, length)] = 0
+        states = self.data["states"][(at - back) % self.buffer_size]
+        for steps in range(self.sequence_length - 1, 0, -1):
+            rows = np.flatnonzero(back >= steps)
+            earlier = (at[rows] - steps) % self.buffer_size
+            left = np.clip((taken["time_left"][rows] + steps) / np.float32(self.rules.dt_max), 0.0, 1.0)
+            seen = self.layout.low_from(
+                self.data["local"][earlier], self.data["here"][earlier], taken["subgoal"][rows], left
+            )
+            states[rows] = self.advance(seen, states[rows])
+        return states, self.advance(observations, states)
+
+    def _intact(self, begin: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which windows still have all their rows: the one being overwritten at the write position has not."""
+        if not self.full:
+            return np.ones(len(begin), dtype=bool)
+        offset = (begin - self.pos) % self.buffer_size  # rows between the oldest row and the window's first
+        return np.asarray(offset + length <= self.buffer_size)

@@ -1,0 +1,86 @@
+"""Goal environments side by side in this process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_tbc.smdp.spaces import GoalObservation
+
+
+class RunningEpisode(NamedTuple):
+    """What it takes to live through an unfinished episode again."""
+
+    seed: int | None  # that the reset was given, or
+    generator: dict[str, Any]  # the state of the task's random generator before the reset
+    actions: list[NDArray[Any]]  # taken since
+
+
+class GoalVecEnv(DummyVecEnv):
+    """SB3's ``DummyVecEnv`` for goal environments: the same results, without its deep copies.
+
+    On tasks that step in microseconds those copies take longer than the task. Observations and infos are still the
+    caller's own: arrays are copied, and so is the dictionary of an info, though not what lies in it.
+
+    The running episodes can be taken out and lived through again in environments made later, which leaves these in the
+    same state if all their randomness comes from ``np_random``, as Gymnasium asks for.
+    """
+
+    def __init__(self, env_fns: list[Callable[[], gym.Env[Any, Any]]]) -> None:
+        super().__init__(env_fns)
+        self.running = [RunningEpisode(None, {}, []) for _ in self.envs]
+
+    def reset(self) -> GoalObservation:  # type: ignore[override]
+        """Begin an episode everywhere."""
+        for index, seed in enumerate(self._seeds):
+            self._note_start(index, seed)
+        return super().reset()  # type: ignore[return-value]
+
+    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+        """Call a method of environments, see SB3; an episode begun this way is noted."""
+        if method_name == "reset":
+            for index in self._get_indices(indices):
+                self._note_start(index, kwargs.get("seed"))
+        return super().env_method(method_name, *args, indices=indices, **kwargs)
+
+    def _note_start(self, index: int, seed: int | None) -> None:
+        generator = self.envs[index].unwrapped.np_random.bit_generator
+        self.running[index] = RunningEpisode(seed, dict(generator.state) if seed is None else {}, [])
+
+    def relive(self, running: Sequence[RunningEpisode]) -> GoalObservation:
+        """Begin the same episodes again and take the same actions; the observations they lead to."""
+        for index, (env, episode) in enumerate(zip(self.envs, running, strict=True)):
+            if episode.seed is None:
+                env.unwrapped.np_random.bit_generator.state = episode.generator
+            observation, self.reset_infos[index] = env.reset(seed=episode.seed)
+            for action in episode.actions:
+                observation = env.step(action)[0]
+            self._save_obs(index, observation)
+            self.running[index] = episode._replace(actions=list(episode.actions))
+        return self._obs_from_buf()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step every environment and reset those whose episode is over."""
+        infos: list[dict[str, Any]] = []
+        for index, env in enumerate(self.envs):
+            action = self.actions[index]
+            observation, self.buf_rews[index], terminated, truncated, given = env.step(action)
+            self.running[index].actions.append(action)
+            info = {**given, "TimeLimit.truncated": truncated and not terminated}
+            over = self.buf_dones[index] = terminated or truncated
+            if over:
+                info["terminal_observation"] = observation
+                self._note_start(index, None)
+                observation, self.reset_infos[index] = env.reset()
+            for key, array in self.buf_obs.items():
+                array[index] = observation[key]
+            infos.append(info)
+        return self._obs_from_buf(), self.buf_rews.copy(), self.buf_dones.copy(), infos  # type: ignore[return-value]
+
+    def _obs_from_buf(self) -> GoalObservation:  # type: ignore[override]
+        return {key: array.copy() for key, array in self.buf_obs.items()}

@@ -1,0 +1,341 @@
+"""Hindsight as pure functions on arrays: what both levels learn from a finished episode. NumPy only.
+
+Two relabellings (paper sections 4.2 and 4.5; HAC and HiTS before it): *hindsight action relabelling* (the paper's HGR)
+replaces an option that was not achieved by the one that was, and *hindsight goal relabelling* replaces the goal by one
+that was reached later. *Testing transitions* punish options that the low level could not achieve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.smdp.options import Episode, OptionRules
+from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
+from sb3_tbc.smdp.spaces import FloatArray, SubgoalSpace
+
+GOAL_STRATEGIES = ("future", "episode", "event")
+"""Where the high level's hindsight goals come from."""
+
+
+def check_goal_strategy(strategy: str, subgoals: SubgoalSpace | None) -> None:
+    """See that hindsight goals can be chosen this way.
+
+    :param subgoals: the task's
+    :raises ValueError: if the strategy is unknown, or the task has no such event
+    """
+    if strategy not in GOAL_STRATEGIES:
+        raise ValueError(f"goal_strategy must be one of {', '.join(GOAL_STRATEGIES)}, got {strategy!r}")
+    if strategy == "event" and (subgoals is None or subgoals.event is None):
+        raise ValueError(
+            "goal_strategy 'event' takes goals from the step of a task's event, and this task names none: use 'future' "
+            "or 'episode', or give its SubgoalSpace the index of the event's flag in the observation"
+        )
+
+
+class GoalTest(NamedTuple):
+    """A task's reward and termination as batched functions of ``(achieved_goal, desired_goal)``."""
+
+    reward: Callable[[FloatArray, FloatArray], FloatArray]  # (n, goal_dim) x 2 -> (n,)
+    terminated: Callable[[FloatArray, FloatArray], NDArray[np.bool_]]  # (n, goal_dim) x 2 -> (n,)
+
+
+class LowLevelSteps(NamedTuple):
+    """The low level's transitions of one episode, one row per environment step."""
+
+    local: FloatArray
+    next_local: FloatArray
+    actions: FloatArray
+    states: FloatArray
+    next_states: FloatArray
+    subgoal: FloatArray  # what was asked for, task units
+    here: FloatArray  # subgoal-space point before the step
+    achieved: FloatArray  # and after it
+    time_left: FloatArray  # (T,) steps of the budget left before the step
+    position: NDArray[np.int64]  # (T,) steps since the window began
+    length: NDArray[np.int64]  # (T,) steps the window took
+    rewards: FloatArray  # (T,)
+    dones: NDArray[np.bool_]  # (T,) the window is over: no bootstrap
+
+
+def low_level_steps(
+    episode: Episode, subgoals: SubgoalSpace, rules: OptionRules, reward: LowLevelReward | None = None
+) -> LowLevelSteps:
+    """Ordinary transitions of the low level.
+
+    A window that the end of the episode cuts off is not over for the low level: its last step bootstraps.
+
+    :param reward: by default 1 where the window ends with its subgoal reached, else 0
+    """
+    reward = reward or LowLevelReward("sparse", subgoals, rules)
+    lengths = np.array([option.duration for option in episode.options])
+    position = np.concatenate([np.arange(n) for n in lengths])
+    per_step = np.repeat(np.arange(len(lengths)), lengths)
+    budget = np.array([option.time_budget for option in episode.options])[per_step]
+    subgoal = np.stack([option.subgoal for option in episode.options])[per_step]
+    seen = _rows(episode, np.arange(episode.length + 1))
+    local, points = subgoals.local(seen), subgoals.achieved(seen)
+    rewards, over = reward.of(
+        points[:-1], points[1:], subgoal, position + 1 >= budget, may_end=position + 1 >= rules.dt_min
+    )
+    return LowLevelSteps(
+        local=local[:-1],
+        next_local=local[1:],
+        actions=episode.actions,
+        states=episode.states,
+        next_states=episode.next_states,
+        subgoal=subgoal,
+        here=points[:-1],
+        achieved=points[1:],
+        time_left=budget - position,
+        position=position,
+        length=lengths[per_step],
+        rewards=rewards,
+        dones=over,
+    )
+
+
+def ordered_pairs(length: NDArray[np.int64], rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """A uniformly drawn pair ``0 <= first <= second < length`` for each window length."""
+    first = rng.integers(0, length)
+    second = rng.integers(0, length + 1)
+    # the half of the (length x length + 1) rectangle above the diagonal folds onto the half below it
+    fold = second > first
+    return np.where(fold, length - second, second), np.where(fold, length - 1 - first, first)
+
+
+class HighLevelSteps(NamedTuple):
+    """The high level's SMDP transitions of one episode, hindsight copies included, one row each."""
+
+    observations: FloatArray
+    actions: FloatArray  # unit coordinates
+    rewards: FloatArray
+    next_observations: FloatArray
+    dones: NDArray[np.bool_]
+    discounts: FloatArray
+    relabelled: NDArray[np.bool_]  # whether the action is a hindsight one
+    durations: NDArray[np.int64]
+    local: FloatArray  # what the low level saw when the option began
+    here: FloatArray  # and the subgoal-space point where it began
+
+
+class HindsightSettings(NamedTuple):
+    """How much hindsight the high level uses."""
+
+    n_goals: int  # goal copies per option
+    goal_strategy: str  # "future", "episode" or "event"
+    testing_penalty: float  # reward of a testing transition, negative
+    keep_original: bool  # also store failed options as they were chosen (paper, algorithm 1 line 26)
+    tolerance: float | None = None  # relabelled options further than this from where they ended are not a success
+    goals_met: str = "passing"  # when a window meets its hindsight goal: "passing" it, or at its "end" alone
+
+
+class GoalRange:
+    """The box of the goals that episodes have asked for so far.
+
+    :param dim: number of goal coordinates
+    """
+
+    def __init__(self, dim: int) -> None:
+        self.bounds: FloatArray = np.stack([np.full(dim, np.inf), np.full(dim, -np.inf)])  # low, high
+
+    def add(self, goal: FloatArray) -> None:
+        """Widen the box by a goal, ``(goal_dim,)``, task units."""
+        self.bounds = np.stack([np.minimum(self.bounds[0], goal), np.maximum(self.bounds[1], goal)])
+
+    def holds(self, goals: FloatArray) -> NDArray[np.bool_]:
+        """Which of ``goals`` ``(n, goal_dim)`` lie in the box, ``(n,)``."""
+        return np.asarray(((goals >= self.bounds[0]) & (goals <= self.bounds[1])).all(axis=-1))
+
+
+def relabel_actions(
+    episode: Episode,
+    subgoals: SubgoalSpace,
+    rules: OptionRules,
+    rng: np.random.Generator,
+    tolerance: float | None = None,
+) -> tuple[FloatArray, NDArray[np.bool_]]:
+    """The action each option turned out to be, ``(n_options, subgoal_dim + 1)``, and which of them changed.
+
+    An achieved option keeps its action; another becomes (point reached, time it took), with the time drawn so that
+    the budget would have expired at just that step.
+
+    :param tolerance: the success test of hindsight (paper section 4.5): where the point that was reached, in unit
+        coordinates, lies further than this from the nearest subgoal there is (outside of the bounds), the hindsight
+        option would not have been a success either, and the option keeps its action; None takes the nearest subgoal
+    """
+    actions = np.stack([option.unit_action for option in episode.options])
+    failed = np.array([not option.reached for option in episode.options])
+    if failed.any():
+        ends = np.array([option.start + option.duration for option in episode.options])[failed]
+        durations = np.array([option.duration for option in episode.options])[failed]
+        reached = subgoals.achieved(_rows(episode, ends))
+        took = durations - rng.random(len(durations))
+        unit = subgoals.scale(reached)
+        if tolerance is not None:
+            success = hindsight_success(unit, np.clip(unit, -1.0, 1.0), tolerance)
+            failed[failed] = success
+            unit, took = unit[success], took[success]
+        actions[failed, :-1] = np.clip(unit, -1.0, 1.0)
+        actions[failed, -1] = rules.unit_budget(np.maximum(took, rules.dt_min))
+    return actions, failed
+
+
+def hindsight_success(reached: FloatArray, subgoal: FloatArray, tolerance: float = 0.05) -> NDArray[np.bool_]:
+    """Whether relabelled options succeed: ``||phi(s') - phi(g_hat)||_2 <= tolerance`` (paper section 4.5), ``(n,)``.
+
+    :param reached: where the options ended, unit coordinates ``(n, subgoal_dim)``
+    :param subgoal: their hindsight subgoals, unit coordinates
+    """
+    return np.asarray(np.linalg.norm(reached - subgoal, axis=-1) <= tolerance)
+
+
+def _rows(episode: Episode, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
+    return {
+        "observation": episode.observation[rows],
+        "achieved_goal": episode.achieved_goal[rows],
+        "desired_goal": episode.desired_goal[rows],
+    }
+
+
+def goal_pairs(
+    n_options: int, n_goals: int, strategy: str, rng: np.random.Generator, event: int | None = None
+) -> NDArray[np.int64]:
+    """Rows ``(option, option whose outcome becomes its goal)`` for hindsight goal relabelling, ``(n, 2)``.
+
+    ``"future"`` draws from the later options of the episode, never an option's own outcome (as HiTS and HAC);
+    ``"episode"`` from all of them; ``"event"`` gives every option one goal, the outcome of the option that the task's
+    event ended, and none in an episode without it (as HiTS in Tennis2D, whose goals hold at the second bounce alone).
+
+    :param event: the option that the event ended, None if there was none
+    """
+    options = np.arange(n_options)
+    if strategy == "event":
+        return np.stack([options, np.full(n_options, event)], axis=1) if event is not None else np.zeros((0, 2), int)
+    if strategy == "episode":
+        pairs = np.repeat(options, min(n_goals, n_options))
+        return np.stack([pairs, rng.integers(0, n_options, len(pairs))], axis=1)
+    later = n_options - 1 - options
+    pairs = np.repeat(options, np.minimum(n_goals, later))
+    return np.stack([pairs, rng.integers(pairs + 1, n_options)], axis=1)
+
+
+def high_level_steps(
+    episode: Episode,
+    subgoals: SubgoalSpace,
+    rules: OptionRules,
+    reward: HighLevelReward,
+    settings: HindsightSettings,
+    goal_test: GoalTest,
+    high_view: Callable[[dict[str, FloatArray]], FloatArray],
+    rng: np.random.Generator,
+    asked: GoalRange | None = None,
+) -> HighLevelSteps:
+    """All SMDP transitions that the high level learns from in one episode, in this order:
+
+    testing transitions (failed tests, chosen action, penalty), hindsight-action transitions of all options, and
+    copies of these with hindsight goals.
+
+    :param high_view: maps goal observations to the high level's flat observation
+    :param asked: hindsight goals outside of it are left out; None keeps all
+    """
+    n = len(episode.options)
+    starts = np.array([option.start for option in episode.options])
+    durations = np.array([option.duration for option in episode.options])
+    ends = starts + durations
+    chosen = np.stack([option.unit_action for option in episode.options])
+    reached = np.array([option.reached for option in episode.options])
+    actions, changed = relabel_actions(episode, subgoals, rules, rng, settings.tolerance)
+    testing = np.array([option.testing for option in episode.options])
+    before, after = _rows(episode, starts), _rows(episode, ends)
+    local, here = subgoals.local(before), subgoals.achieved(before)
+    rewards = reward.of(episode.rewards, starts, durations)
+    bonus = reward.completion_bonus * (reached | changed)
+    dones = np.zeros(n, dtype=bool)
+    dones[-1] = episode.terminated
+
+    def steps(
+        rows: NDArray[np.int64],
+        actions: FloatArray,
+        rewards: FloatArray,
+        dones: NDArray[np.bool_],
+        durations: NDArray[np.int64],
+        relabelled: bool,
+        goals: FloatArray | None = None,
+    ) -> HighLevelSteps:
+        old, new = ({k: v[rows] for k, v in part.items()} for part in (before, after))
+        if goals is not None:
+            old["desired_goal"] = new["desired_goal"] = goals
+        return HighLevelSteps(
+            high_view(old), actions, rewards, high_view(new), dones, reward.discounts(durations),
+            changed[rows] & relabelled, durations, local[rows], here[rows],
+        )  # fmt: skip
+
+    def charged(rewards: FloatArray, actions: FloatArray) -> FloatArray:
+        return rewards - reward.duration_cost * rules.budget(actions[:, -1]) / rules.dt_max
+
+    parts = []
+    tests = np.flatnonzero(testing & ~reached)
+    penalty = np.full(len(tests), settings.testing_penalty)
+    parts.append(steps(tests, chosen[tests], penalty, dones[tests], durations[tests], False))
+    if settings.keep_original:
+        kept = np.flatnonzero(changed & ~testing)
+        parts.append(
+            steps(kept, chosen[kept], charged(rewards[kept], chosen[kept]), dones[kept], durations[kept], False)
+        )
+    every = np.flatnonzero(reached | changed | ~testing)  # a failed test without a hindsight action has its penalty
+    gained = charged(rewards, actions) + bonus
+    parts.append(steps(every, actions[every], gained[every], dones[every], durations[every], True))
+    happened = np.flatnonzero(subgoals.happened(after))
+    event = int(happened[0]) if len(happened) else None
+    pairs = goal_pairs(n, settings.n_goals, settings.goal_strategy, rng, event)
+    if asked is not None:
+        pairs = pairs[asked.holds(episode.achieved_goal[ends[pairs[:, 1]]])]
+    if len(pairs):
+        goals = episode.achieved_goal[ends[pairs[:, 1]]]
+        at_end = reward.target == "decision" or settings.goals_met == "end"
+        copies = relabel_goals(episode, starts[pairs[:, 0]], durations[pairs[:, 0]], goals, reward, goal_test, at_end)
+        rows = pairs[:, 0]
+        again = charged(copies.rewards, actions[rows]) + bonus[rows]
+        parts.append(steps(rows, actions[rows], again, copies.dones, copies.durations, True, goals))
+    return HighLevelSteps(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+class RelabelledGoals(NamedTuple):
+    """Reward, end and length of windows under other goals."""
+
+    rewards: FloatArray
+    dones: NDArray[np.bool_]
+    durations: NDArray[np.int64]
+
+
+def relabel_goals(
+    episode: Episode,
+    starts: NDArray[np.int64],
+    durations: NDArray[np.int64],
+    goals: FloatArray,
+    reward: HighLevelReward,
+    goal_test: GoalTest,
+    at_end: bool,
+) -> RelabelledGoals:
+    """Rewards of windows had their goals been ``goals`` (n, goal_dim).
+
+    :param at_end: look at the last step only, as HiTS does; else a window ends at the first step that meets the new
+        goal, as the episode would have. Where motion is erratic a goal is passed by chance, and the hindsight action,
+        the point where the window ended, would seldom pass it again
+    """
+    offsets = np.concatenate([[0], np.cumsum(durations)[:-1]])
+    step = np.arange(int(durations.sum())) - np.repeat(offsets, durations) + np.repeat(starts, durations)
+    achieved, wanted = episode.achieved_goal[step + 1], np.repeat(goals, durations, axis=0)
+    step_rewards, met = goal_test.reward(achieved, wanted), goal_test.terminated(achieved, wanted)
+    last = offsets + durations - 1
+    if at_end:
+        return RelabelledGoals(reward.of(step_rewards, offsets, durations), met[last], durations)
+    met_before: NDArray[np.int64] = np.cumsum(met) - met
+    over = met_before - np.repeat(met_before[offsets], durations) > 0
+    rewards = reward.of(np.where(over, 0.0, step_rewards), offsets, durations)
+    dones = np.logical_or.reduceat(met, offsets)
+    return RelabelledGoals(rewards, dones, np.add.reduceat(~over, offsets).astype(np.int64))

@@ -1,0 +1,164 @@
+"""Evaluation: success inside the time limit and, with two levels, inside the high level's action budget."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal
+from sb3_tbc.smdp.spaces import FloatArray
+from sb3_tbc.tbc_hrl.collection import forget
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
+
+
+class EvaluationResult(NamedTuple):
+    """One entry per evaluated episode, in the order of the environments and of their episodes."""
+
+    successes: NDArray[np.bool_]
+    lengths: NDArray[np.int64]  # environment steps
+    rewards: FloatArray  # undiscounted sums
+    subgoal_success: FloatArray  # share of options that reached their subgoal
+    mean_window: FloatArray  # mean option length, environment steps
+    decisions: NDArray[np.int64]  # options used
+    budget_exhausted: NDArray[np.bool_]  # the episode failed because its action budget was used up
+
+    @property
+    def success_rate(self) -> float:
+        """Share of successful episodes."""
+        return float(self.successes.mean())
+
+    @property
+    def mean_length_success(self) -> float | None:
+        """Mean length of the successful episodes, None if there is none."""
+        return float(self.lengths[self.successes].mean()) if self.successes.any() else None
+
+
+Agent = TBCHRL | FlatSAC
+"""What can be trained and evaluated here."""
+
+
+def evaluate_agent(
+    model: Agent,
+    env: VecEnv | gym.Env[Any, Any],
+    n_eval_episodes: int = 100,
+    seed: int | None = None,
+    deterministic: bool = True,
+) -> EvaluationResult:
+    """Evaluate an agent of any of our algorithms, see :func:`evaluate_hierarchical`."""
+    if isinstance(model, FlatSAC):
+        return evaluate_flat(model, env, n_eval_episodes, seed, deterministic)
+    return evaluate_hierarchical(model, env, n_eval_episodes, seed, deterministic)
+
+
+def evaluate_flat(
+    model: FlatSAC,
+    env: VecEnv | gym.Env[Any, Any],
+    n_eval_episodes: int = 100,
+    seed: int | None = None,
+    deterministic: bool = True,
+) -> EvaluationResult:
+    """As :func:`evaluate_hierarchical`, for an agent without subgoals: these figures are NaN, decisions are 0."""
+    venv = _vector(env, n_eval_episodes)
+    if seed is not None:
+        venv.seed(seed)
+    observation = venv.reset()
+    totals = np.zeros((2, venv.num_envs))  # steps, rewards
+    results: list[list[tuple[Any, ...]]] = [[] for _ in range(venv.num_envs)]
+    per_env = -(-n_eval_episodes // venv.num_envs)
+    while min(len(rows) for rows in results) < per_env:
+        actions, _ = model.predict(observation, deterministic=deterministic)  # type: ignore[arg-type]
+        observation, rewards, dones, infos = venv.step(actions)
+        totals += np.stack([np.ones(venv.num_envs), rewards])
+        for index in np.flatnonzero(dones):
+            success = bool(infos[index].get("is_success", False))
+            results[index].append((success, *totals[:, index], np.nan, np.nan, 0, False))
+            totals[:, index] = 0.0
+    return _columns([rows[i] for i in range(per_env) for rows in results], n_eval_episodes)
+
+
+def evaluate_hierarchical(
+    model: TBCHRL,
+    env: VecEnv | gym.Env[Any, Any],
+    n_eval_episodes: int = 100,
+    seed: int | None = None,
+    deterministic: bool = True,
+) -> EvaluationResult:
+    """Run whole episodes and count successes as the paper does (section 5.1).
+
+    Every environment of the vector runs the same number of episodes (rounded up, the surplus is left out), so that
+    short episodes are not over-represented.
+
+    :param model: a trained agent
+    :param env: a goal environment or a vector of them
+    :param n_eval_episodes: episodes to run
+    :param seed: seeds the environments (environment i gets ``seed + i``), for episode-by-episode comparisons
+    :param deterministic: use the means of both levels (and the averaged actors)
+    :raises ValueError: if ``n_eval_episodes`` is not positive
+    """
+    venv = _vector(env, n_eval_episodes)
+    runner = _Runner(model, venv, deterministic, np.random.default_rng(seed))
+    if seed is not None:
+        venv.seed(seed)
+    per_env = -(-n_eval_episodes // venv.num_envs)
+    return _columns(runner.run(per_env), n_eval_episodes)
+
+
+def _vector(env: VecEnv | gym.Env[Any, Any], n_eval_episodes: int) -> VecEnv:
+    if n_eval_episodes < 1:
+        raise ValueError(f"n_eval_episodes must be at least 1, got {n_eval_episodes}")
+    return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
+
+
+def _columns(rows: list[tuple[Any, ...]], n_eval_episodes: int) -> EvaluationResult:
+    columns = list(zip(*rows[:n_eval_episodes], strict=True))
+    types = (bool, np.int64, np.float64, np.float64, np.float64, np.int64, bool)
+    return EvaluationResult(*(np.array(column, dtype=t) for column, t in zip(columns, types, strict=True)))
+
+
+class _Runner:
+    """Drives a hierarchical vector environment with both levels' policies."""
+
+    def __init__(self, model: TBCHRL, venv: VecEnv, deterministic: bool, rng: np.random.Generator) -> None:
+        self.model, self.deterministic, self.rng = model, deterministic, rng
+        self.env = HierarchicalVecEnv(venv, self._propose, model.layout, model.rules, schedule=model.schedule)
+
+    def _propose(self, observations: FloatArray, where: NDArray[np.intp]) -> Proposal:
+        no_state = np.zeros((len(where), 0), dtype=np.float32)
+        unit, _ = self.model.high.act(observations, no_state, self.deterministic, self.rng, average=self.deterministic)
+        return Proposal(unit.astype(np.float64), np.zeros(len(where), dtype=bool))
+
+    def run(self, per_env: int) -> list[tuple[Any, ...]]:
+        """``per_env`` episodes in every environment; one row each, ordered by round, then environment."""
+        model, env = self.model, self.env
+        observation = env.reset()
+        state_dim = model.low.policy.actor.state_dim
+        membrane = np.zeros((env.num_envs, state_dim), dtype=np.float32)
+        results: list[list[tuple[Any, ...]]] = [[] for _ in range(env.num_envs)]
+        while min(len(rows) for rows in results) < per_env:
+            unit, membrane = model.low.act(
+                observation, membrane, self.deterministic, self.rng, average=self.deterministic
+            )
+            seen, _, window_over, infos = env.step(model.policy._unscale(unit))
+            observation = np.asarray(seen)
+            membrane = forget(membrane, model.memory, window_over, infos)
+            over = [index for index in range(env.num_envs) if infos[index].get("episode_over")]
+            for index, episode in zip(over, env.episodes, strict=True):
+                options = episode.options
+                results[index].append(
+                    (
+                        episode.success,
+                        episode.length,
+                        episode.rewards.sum(),
+                        np.mean([option.reached for option in options]),
+                        np.mean([option.duration for option in options]),
+                        len(options),
+                        infos[index]["budget_exhausted"],
+                    )
+                )
+            env.episodes = []
+        return [rows[i] for i in range(per_env) for rows in results]

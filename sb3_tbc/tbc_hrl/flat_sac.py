@@ -1,0 +1,169 @@
+"""The flat baseline: Stable-Baselines3's own SAC with hindsight experience replay, behind our runner."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+import warnings
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.sac.policies import MultiInputPolicy
+
+from sb3_tbc.files import write_arrays
+from sb3_tbc.smdp.hindsight import check_goal_strategy
+from sb3_tbc.tbc_hrl.config import attribute_of
+
+CYCLE = 100
+"""Environment steps between two bursts of updates."""
+
+
+class TerminatingHerReplayBuffer(HerReplayBuffer):
+    """SB3's hindsight replay for tasks that end on success: a relabelled transition that meets its goal is terminal.
+
+    SB3 keeps the flag that was stored, under which the value of standing on a relabelled goal never stops to grow.
+
+    :param event_goals: take the goal from the step of the task's event (:attr:`SubgoalSpace.event`) for all transitions
+        of an episode in which it happened, and leave those of the others as they are
+    :param kwargs: see SB3
+    """
+
+    def __init__(self, *args: Any, event_goals: bool = False, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.event_goals = event_goals
+
+    def _sample_goals(self, batch_indices: NDArray[Any], env_indices: NDArray[Any]) -> NDArray[Any]:
+        if not self.event_goals or self.env is None:
+            return super()._sample_goals(batch_indices, env_indices)
+        event = attribute_of(self.env, "subgoals").event
+        starts, lengths = (a[batch_indices, env_indices, None] for a in (self.ep_start, self.ep_length))
+        ahead = np.arange(lengths.max())
+        rows = (starts + ahead) % self.buffer_size
+        happened = (self.next_observations["observation"][rows, env_indices[:, None], event] > 0.5) & (ahead < lengths)
+        first = rows[np.arange(len(rows)), happened.argmax(axis=1)]
+        goals: NDArray[Any] = np.where(
+            happened.any(axis=1, keepdims=True),
+            self.next_observations["achieved_goal"][first, env_indices],
+            self.observations["desired_goal"][batch_indices, env_indices],
+        )
+        return goals
+
+    def _get_virtual_samples(
+        self, batch_indices: NDArray[Any], env_indices: NDArray[Any], env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        samples = super()._get_virtual_samples(batch_indices, env_indices, env)
+        if self.env is None:
+            raise ValueError("hindsight replay needs the environment's goal test; pass env when loading")
+        reached = samples.next_observations["achieved_goal"].cpu().numpy()
+        wanted = samples.observations["desired_goal"].cpu().numpy()
+        over = self.env.env_method("compute_terminated", reached, wanted, {}, indices=[0])[0]
+        dones = np.broadcast_to(np.asarray(over), (len(reached),)).astype(np.float32)
+        return samples._replace(dones=th.from_numpy(dones).reshape(-1, 1).to(self.device))
+
+
+class FlatSAC(SAC):
+    """SB3's SAC, goal-conditioned, with :class:`TerminatingHerReplayBuffer`, under the names of our configurations.
+
+    :param policy: ``"MultiInputPolicy"``
+    :param env: a goal environment
+    :param gradient_ratio: updates per environment step, done every 100 steps
+    :param n_hindsight_goals: relabelled samples per plain one
+    :param goal_strategy: ``"future"``, ``"episode"`` or ``"final"``, see SB3, or ``"event"``, see the buffer
+    :param kwargs: SAC's own parameters
+    :raises ValueError: if ``gradient_ratio`` is negative, or ``goal_strategy`` ``"event"`` on a task without one
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
+    default_circuit: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str,
+        *,
+        gradient_ratio: float = 1.0,
+        n_hindsight_goals: float = 3,
+        goal_strategy: str = "future",
+        policy_kwargs: Mapping[str, Any] | None = None,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        if gradient_ratio < 0:
+            raise ValueError(f"gradient_ratio must not be negative, got {gradient_ratio}")
+        self.gradient_ratio = gradient_ratio
+        by_event = goal_strategy == "event"
+        hindsight = {
+            "n_sampled_goal": int(n_hindsight_goals),
+            "goal_selection_strategy": "future" if by_event else goal_strategy,
+            "event_goals": by_event,
+        }
+        super().__init__(
+            policy,  # type: ignore[arg-type]
+            env,
+            train_freq=(CYCLE, "step"),
+            gradient_steps=max(round(CYCLE * gradient_ratio), 1),
+            replay_buffer_class=TerminatingHerReplayBuffer,
+            replay_buffer_kwargs=hindsight,
+            policy_kwargs=dict(policy_kwargs or {}),
+            _init_setup_model=False,
+            **kwargs,
+        )
+        if by_event and self.env is not None:
+            check_goal_strategy(goal_strategy, attribute_of(self.env, "subgoals"))
+        if _init_setup_model:
+            self._setup_model()
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """As SAC's, once there is a finished episode to take goals from."""
+        buffer = self.replay_buffer
+        if isinstance(buffer, HerReplayBuffer) and buffer.ep_length.any():
+            super().train(gradient_steps, batch_size)
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Write the replay buffer as plain arrays, atomically."""
+        buffer = self._her_buffer()
+        arrays: dict[str, Any] = {name: getattr(buffer, name) for name in ARRAYS}
+        for part in ("observations", "next_observations"):
+            arrays |= {f"{part}.{key}": array for key, array in getattr(buffer, part).items()}
+        rows = buffer.buffer_size if buffer.full else buffer.pos
+        arrays = {name: array[:rows] for name, array in arrays.items()}
+        write_arrays(path, {**arrays, "_start": buffer._current_ep_start, "pos": buffer.pos, "full": buffer.full})
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Read what :meth:`save_replay_buffer` wrote; only plain arrays are read, never pickled objects.
+
+        :param truncate_last_traj: close the episode that was running when the buffer was saved
+        :raises ValueError: if the file was written for other spaces or a larger buffer
+        """
+        buffer = self._her_buffer()
+        with np.load(path, allow_pickle=False) as arrays:
+            rows = len(arrays["actions"])
+            for name in arrays.files:
+                part, _, key = name.partition(".")
+                if key or name in ARRAYS:
+                    held = getattr(buffer, part)[key] if key else getattr(buffer, name)
+                    if rows > len(held) or held.shape[1:] != arrays[name].shape[1:]:
+                        raise ValueError(f"saved replay buffer does not fit: {name} has shape {arrays[name].shape}")
+                    held[:rows] = arrays[name]
+            buffer._current_ep_start[:] = arrays["_start"]
+            buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
+        if truncate_last_traj and (buffer._current_ep_start != buffer.pos).any():
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # SB3 warns of what was just asked for
+                buffer.truncate_last_trajectory()
+
+    def _her_buffer(self) -> HerReplayBuffer:
+        if not isinstance(self.replay_buffer, HerReplayBuffer):
+            raise ValueError("there is no replay buffer: pass env when loading the agent")
+        return self.replay_buffer
+
+
+ARRAYS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+"""What SB3's hindsight buffer holds besides observations, each ``(buffer_size, n_envs, ...)``."""

@@ -1,0 +1,167 @@
+"""Acting with both levels: the policy whose ``predict`` carries the live option and the membrane potentials."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+
+from sb3_tbc.errors import NonFiniteError
+from sb3_tbc.level.level import SACLevel
+from sb3_tbc.level.policies import NDBCActor
+from sb3_tbc.ndbc.diagnostics import check_finite
+from sb3_tbc.smdp.hierarchical_vec_env import Schedule
+from sb3_tbc.smdp.options import OptionRules
+from sb3_tbc.smdp.spaces import FloatArray
+from sb3_tbc.smdp.views import GOAL_KEYS, LevelLayout
+
+
+class TwoLevelState(NamedTuple):
+    """What ``predict`` hands on from step to step, one row per environment."""
+
+    subgoal: FloatArray  # (n, subgoal_dim), task units
+    time_budget: FloatArray  # (n,), steps
+    elapsed: NDArray[np.int64]  # (n,), steps since the option began
+    used: NDArray[np.int64]  # (n,), options begun in this episode
+    membrane: FloatArray  # (n, state_dim)
+
+
+class TBCPolicy(BasePolicy):
+    """Both levels as one policy.
+
+    :param observation_space: the task's goal observation
+    :param action_space: the task's action box
+    :param high: the high level
+    :param low: the low level
+    :param layout: how the levels' observations are put together
+    :param rules: what ends an option
+    :param memory: when the membrane is reset: at each new ``"window"``, ``"episode"``, or at every step (``"none"``)
+    :param seed: of the noise that ``predict(deterministic=False)`` draws
+    :param schedule: gives the time budgets where the high level does not
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Dict,
+        action_space: spaces.Box,
+        high: SACLevel,
+        low: SACLevel,
+        layout: LevelLayout,
+        rules: OptionRules,
+        memory: str,
+        seed: int | None = None,
+        schedule: Schedule | None = None,
+    ) -> None:
+        super().__init__(observation_space, action_space, squash_output=True)
+        self.high_policy, self.low_policy = high.policy, low.policy
+        self._levels = (high, low)
+        self.layout, self.rules, self.memory, self.schedule = layout, rules, memory, schedule
+        self.rng = np.random.default_rng(seed)
+
+    def initial_state(self, n_envs: int) -> TwoLevelState:
+        """State of ``n_envs`` environments that have not begun an option."""
+        return TwoLevelState(
+            np.zeros((n_envs, self.layout.subgoals.dim)),
+            np.zeros(n_envs),
+            np.zeros(n_envs, dtype=np.int64),
+            np.zeros(n_envs, dtype=np.int64),
+            np.zeros((n_envs, self._levels[1].policy.actor.state_dim), dtype=np.float32),
+        )
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """Primitive actions for one observation or a batch of them.
+
+        Pass the returned state back in with the next observation: it holds the live subgoal, its time budget and the
+        membrane potentials. ``state=None`` begins a new episode. The action budget is counted in ``state.used`` but
+        not enforced: a deployed agent goes on.
+
+        :param deterministic: use the means of both levels, and the averaged actors where they are kept
+        :return: actions in the environment's units, and the new state
+        :raises ValueError: if the observation is not that of a goal environment
+        :raises NonFiniteError: if a level answers with NaN
+        """
+        batch, single = self._as_batch(observation)
+        n = len(batch["observation"])
+        now = self.initial_state(n) if state is None else TwoLevelState(*(np.array(part) for part in state))
+        starts = np.ones(n, bool) if state is None else np.zeros(n, bool)
+        if episode_start is not None:
+            starts |= np.asarray(episode_start, dtype=bool)
+        self._begin_options(now, batch, starts, deterministic)
+        remaining = self.rules.remaining(now.time_budget - now.elapsed)
+        seen = self.layout.low(batch, now.subgoal, remaining)
+        unit, membrane = self._levels[1].act(seen, now.membrane, deterministic, self.rng, average=deterministic)
+        if not np.isfinite(unit).all():
+            self._name_non_finite(seen, membrane, unit, now.elapsed)
+        actions = self._unscale(unit)
+        after = now._replace(elapsed=now.elapsed + 1, membrane=membrane)
+        return (actions[0] if single else actions), cast("tuple[NDArray[Any], ...]", after)
+
+    def _begin_options(
+        self, now: TwoLevelState, batch: dict[str, NDArray[Any]], starts: NDArray[np.bool_], deterministic: bool
+    ) -> None:
+        """Replace the options that are over, in place."""
+        now.used[starts] = 0
+        over = starts | (now.elapsed >= now.time_budget) | (self.layout.subgoals.happened(batch) & (now.elapsed > 0))
+        if self.rules.window_end == "reached":
+            reached = self.layout.subgoals.reached(self.layout.subgoals.achieved(batch), now.subgoal)
+            over |= reached & (now.elapsed >= self.rules.dt_min)
+        forget = {"window": over, "episode": starts, "none": np.ones_like(over)}[self.memory]
+        now.membrane[forget] = 0.0
+        where = np.flatnonzero(over)
+        if len(where):
+            seen = {key: batch[key][where] for key in GOAL_KEYS}
+            no_state = np.zeros((len(where), 0), dtype=np.float32)
+            unit, _ = self._levels[0].act(
+                self.layout.high(seen), no_state, deterministic, self.rng, average=deterministic
+            )
+            if not np.isfinite(unit).all():
+                raise NonFiniteError(f"high level, subgoal or time budget {unit.tolist()} for observation {seen}")
+            unit = unit.astype(np.float64)  # as while learning: a rounding error can change the length of a window
+            if self.schedule is not None:
+                unit = self.schedule(unit, seen)
+            now.subgoal[where] = self.layout.subgoals.unscale(unit[:, :-1])
+            now.time_budget[where] = self.rules.budget(unit[:, -1])
+            now.elapsed[where] = 0
+            now.used[where] += 1
+
+    def _name_non_finite(
+        self, seen: FloatArray, membrane: FloatArray, unit: FloatArray, elapsed: NDArray[np.int64]
+    ) -> None:
+        """Raise, naming where the low level stopped being finite; steps count from the beginning of the option."""
+        row = int(np.flatnonzero(~np.isfinite(unit).all(axis=1))[0])
+        actor, step, one = self.low_policy.actor, int(elapsed[row]), slice(row, row + 1)
+        if isinstance(actor, NDBCActor):
+            check_finite(actor.net.wiring, seen[one], membrane[one], unit[one], "low", step)
+        raise NonFiniteError(f"low level, step {step}: action {unit[row].tolist()} for inputs {seen[row].tolist()}")
+
+    def _as_batch(self, observation: Any) -> tuple[dict[str, NDArray[Any]], bool]:
+        if not isinstance(observation, dict) or any(key not in observation for key in GOAL_KEYS):
+            found = sorted(observation) if isinstance(observation, dict) else type(observation).__name__
+            raise ValueError(f"predict needs a goal observation with the keys {sorted(GOAL_KEYS)}, got {found}")
+        single_precision = {key: np.asarray(observation[key], dtype=np.float32) for key in GOAL_KEYS}
+        batch = {key: part.astype(np.float64) for key, part in single_precision.items()}  # as exported policies see it
+        single = batch["observation"].ndim == 1
+        return ({key: part[None] for key, part in batch.items()} if single else batch), single
+
+    def _unscale(self, unit: FloatArray) -> FloatArray:
+        space = cast(spaces.Box, self.action_space)
+        return (space.low + 0.5 * (unit + 1.0) * (space.high - space.low)).astype(space.dtype)
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        """SB3's tensor form of a single, memoryless step."""
+        batch = {key: np.asarray(part) for key, part in observation.items()}
+        return th.as_tensor(self.predict(batch, deterministic=deterministic)[0])
+
+    def forward(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        """Same as ``_predict``."""
+        return self._predict(observation, deterministic)

@@ -1,0 +1,288 @@
+"""``python -m sb3_tbc.tune``: search settings for a task, several seeds per trial, resumable, on several processes."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch as th
+
+from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tune.objectives import ACROSS, OBJECTIVES
+from sb3_tbc.tune.search_space import complete, load_space, restrict
+from sb3_tbc.zoo.algorithms import algorithm, build_model
+from sb3_tbc.zoo.config import CONFIGS, RunConfig, config_file, load_config, merge, parse_overrides, read_file
+from sb3_tbc.zoo.environments import make_envs, resolve_env
+
+if TYPE_CHECKING:
+    from optuna.study import Study
+
+    from sb3_tbc.tune.study import StudySettings
+
+ASKED = (
+    *("config", "config_file", "search_space", "search", "hyperparams", "n_timesteps", "n_envs", "n_seeds"),
+    *("first_seed", "objective", "across_seeds", "threshold", "eval_freq", "n_eval_episodes", "n_final_episodes"),
+)
+"""Options that decide what trials are compared; an existing study has them already, and others are refused."""
+DEFAULTS: dict[str, Any] = {
+    "n_seeds": 2,
+    "first_seed": 0,
+    "objective": "auc",
+    "across_seeds": "mean",
+    "threshold": 0.9,
+    "n_eval_episodes": 20,
+    "n_final_episodes": 20,
+}
+
+
+def build_parser() -> Parser:
+    """The command's arguments."""
+    parser = Parser("sb3_tbc.tune", description=__doc__)
+    add = parser.add_argument
+    add("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
+    add("--env", default="Pendulum", help="a task's short name or any registered goal environment id")
+    add("--study-name", help="an existing one is resumed; by default <algo>-<task>")
+    add("--n-trials", type=positive_int, default=30, help="trials of the whole study, those done before included")
+    add("--workers", type=positive_int, default=1, help="processes on this machine")
+    add("--storage", help="journal file (*.log) or any Optuna URL; by default <log-folder>/<study>/journal.log")
+    add("--sampler", default="tpe", help="tpe, random, or another of optuna.samplers")
+    add("--sampler-seed", type=int, default=0)
+    add("--pruner", default="median+wilcoxon", help="median, hyperband, halving, wilcoxon, none, or two joined by +")
+    add("--minutes", type=float, default=math.inf, help="no trial begins after so long")
+    add("--grace-seconds", type=positive_int, default=120, help="a worker silent for so long counts as dead")
+    add("--log-folder", type=Path, default=Path("runs/tune"), help="runs go to <folder>/<study>/trial_<n>/seed_<s>")
+    add("--device", default="cpu")
+    add("--trial", metavar="best|N", help="train from this trial, on its settings and --seed, instead of searching")
+    add("--seed", type=int, default=0, help="with --trial: of the training")
+    add("--overwrite", action="store_true", help="with --trial: replace an earlier run of that trial and seed")
+    same = parser.add_argument_group("what trials share; fixed when a study begins, and not needed to resume it")
+    add = same.add_argument
+    add("--n-seeds", type=positive_int, help="training runs per trial (2)")
+    add("--first-seed", type=int, help="their seeds count up from here (0)")
+    add("--objective", choices=list(OBJECTIVES), help="; ".join(f"{k}: {o.text}" for k, o in OBJECTIVES.items()))
+    add("--across-seeds", choices=list(ACROSS), help="how seeds make a trial's value (mean)")
+    add("--threshold", type=float, help="success rate that steps-to-success waits for (0.9)")
+    add("--n-timesteps", type=positive_int, help="environment steps per run; by default the task's")
+    add("--n-envs", type=positive_int, help="parallel environments per run")
+    add("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a fortieth")
+    add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (20)")
+    add("--n-final-episodes", type=positive_int, help="episodes of the evaluation after training (20)")
+    add("--config", choices=CONFIGS, help="where all that is not searched comes from; by default tuned if there is one")
+    add("--config-file", type=Path, help="another file with sections like those of zoo_configs")
+    add("--hyperparams", nargs="+", metavar="K:V", help="settings that are fixed, so not searched")
+    add("--search", nargs="+", metavar="NAME", help="search only these parameters; * and ? allowed")
+    add("--search-space", type=Path, help="file that changes ranges, see zoo_configs/search")
+    return parser
+
+
+# --------------------------------------------------------------------------------------------- a new study
+
+
+def asked(args: argparse.Namespace) -> dict[str, Any]:
+    """The options given that decide what is compared, as plain data."""
+    given = {name: getattr(args, name) for name in ASKED if getattr(args, name) is not None}
+    return {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
+
+
+def new_settings(args: argparse.Namespace) -> StudySettings:
+    """What the trials of a new study share.
+
+    :raises ConfigError: for unknown names and wrong values, before anything is written
+    """
+    from sb3_tbc.tune.study import StudySettings
+
+    task, env_id = resolve_env(args.env)
+    fixed = parse_overrides(args.hyperparams or [])
+    options = {name: getattr(args, name) if getattr(args, name) is not None else DEFAULTS[name] for name in DEFAULTS}
+    if not 0 < options["threshold"] <= 1:
+        raise ConfigError(f"--threshold is a success rate above 0 and at most 1, got {options['threshold']}")
+    runs = baselines(args, task, env_id, fixed)
+    wanted = args.config or next(reversed(runs))
+    base = runs[wanted] if wanted in runs else next(iter(runs.values()))
+    runs = {name: replace(run, n_timesteps=base.n_timesteps) for name, run in runs.items()}  # one budget for all
+    eval_freq = args.eval_freq or min(max(base.n_timesteps // 40, 100), base.n_timesteps)
+    if eval_freq > base.n_timesteps:
+        raise ConfigError(
+            f"--eval-freq must be at most the {base.n_timesteps} steps of a run, or none is evaluated; got {eval_freq}"
+        )
+    resolved = {"n_timesteps": base.n_timesteps, "n_envs": base.n_envs, "eval_freq": eval_freq}
+    space = restrict(load_space(args.algo, task, args.search_space), base, args.search or [], fixed)
+    return StudySettings(
+        algo=args.algo,
+        env=args.env,
+        task=task,
+        env_id=env_id,
+        base=base.to_dict(),
+        baselines={name: run.to_dict() for name, run in runs.items()},
+        space=space,
+        eval_freq=eval_freq,
+        asked={**options, **resolved, **asked(args)},
+        **options,
+    )
+
+
+def baselines(args: argparse.Namespace, task: str, env_id: str, fixed: dict[str, Any]) -> dict[str, RunConfig]:
+    """The configurations of the first trials: the paper's row and the shipped tuned one, or what ``train`` would run.
+
+    :raises ConfigError: if one of them cannot be built
+    """
+    known = task in read_file(args.config_file or config_file(args.algo))
+    names: list[str | None] = list(CONFIGS) if known else [args.config]
+    runs: dict[str, RunConfig] = {}
+    for name in names:
+        run = load_config(args.algo, task, name, fixed, path=args.config_file)
+        run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
+        run = _checked(run, env_id)
+        if not any(run.model == other.model and run.env_kwargs == other.env_kwargs for other in runs.values()):
+            runs[name if known and name else "default"] = run
+    return runs
+
+
+def _checked(run: RunConfig, env_id: str) -> RunConfig:
+    """A configuration with its circuit written out, after building its agent once with small buffers.
+
+    :raises ConfigError: if the task or the agent refuses
+    """
+    env = make_envs(env_id, 1, 0, run.env_kwargs)
+    try:
+        action_dim = int(math.prod(env.action_space.shape or (1,)))
+        run = complete(run, action_dim)
+        hierarchical = issubclass(algorithm(run.algo), TBCHRL)
+        small: dict[str, Any] = {"buffer_size": 1000}
+        small = {level: small for level in ("low", "high")} if hierarchical else small
+        build_model(replace(run, model=merge(run.model, small)), env, 0)
+    finally:
+        env.close()
+    return run
+
+
+# --------------------------------------------------------------------------------------------- the command
+
+
+def open_command_study(args: argparse.Namespace) -> tuple[Study, StudySettings, str, Path]:
+    """Open or begin the study of a command: it, its settings, its storage and its folder.
+
+    :raises ConfigError: for a user's mistake
+    """
+    from sb3_tbc.tune import study as studies
+
+    algorithm(args.algo)
+    task, _ = resolve_env(args.env)
+    studies.make_sampler(args.sampler, args.sampler_seed)
+    name = args.study_name or f"{args.algo}-{task}".replace("/", "_").replace(":", "_")
+    folder = args.log_folder / name
+    storage = args.storage or str(folder / "journal.log")
+    given = {"algo": args.algo, "env": task, **asked(args)}
+    fresh = studies.is_url(storage) or not Path(storage).is_file()
+    wanted = new_settings(args) if fresh and args.trial is None else None  # mistakes are told before a file is made
+    if args.trial is not None and not studies.is_url(storage) and not Path(storage).is_file():
+        raise ConfigError(f"no study {name!r}: there is no {storage}; search first, or name its --storage")
+    opened = studies.open_storage(storage, args.grace_seconds)
+    if wanted is None and args.trial is None and name not in studies.names(opened):
+        wanted = new_settings(args)
+    study, settings = studies.open_study(
+        opened, name, studies.shown(storage), wanted, given if args.trial is None else {}
+    )
+    return study, settings, storage, folder
+
+
+def command(argv: Sequence[str]) -> int:
+    """Search, or train from a trial; see ``--help``."""
+    args = build_parser().parse_args(argv)
+    if find_spec("optuna") is None:
+        raise ConfigError("searching needs Optuna: pip install 'sb3_tbc[tune]'")
+    if not args.minutes > 0:
+        raise ConfigError(f"--minutes must be above 0, got {args.minutes:g}")
+    th.set_num_threads(1)
+    from sb3_tbc.tune.pruning import make_pruner
+
+    make_pruner(args.pruner, 1, 1)
+    study, settings, storage, folder = open_command_study(args)
+    if args.trial is not None:
+        return train_from(args, study, settings, folder)
+    return search(args, study, settings, storage, folder)
+
+
+def search(args: argparse.Namespace, study: Study, settings: StudySettings, storage: str, folder: Path) -> int:
+    """Run the workers and write what was found."""
+    from sb3_tbc.tune.study import count_done, shown
+    from sb3_tbc.tune.worker import Job, run_workers
+
+    stop_like_ctrl_c()
+    runs = f"{settings.n_seeds} seeds of {settings.run.n_timesteps:,} steps each"
+    print(f"study          {study.study_name}: {settings.algo} on {settings.task}, {settings.objective}, {runs}")
+    print(f"storage        {shown(storage)}   ({count_done(study)} of {args.n_trials} trials done)")
+    print(f"dashboard      pip install optuna-dashboard; optuna-dashboard {shlex.quote(shown(storage))}", flush=True)
+    until = time.time() + 60.0 * args.minutes
+    job = Job(storage, study.study_name, folder, args.n_trials, args.sampler, args.pruner, args.sampler_seed,
+              args.device, args.grace_seconds, until)  # fmt: skip
+    status = 0
+    try:
+        status = run_workers(job, args.workers)
+    except KeyboardInterrupt:
+        print("\nstopped; the same command goes on", file=sys.stderr)
+        status = INTERRUPTED
+    summarise(study, settings, folder)
+    return status
+
+
+def summarise(study: Study, settings: StudySettings, folder: Path) -> None:
+    """Write the table, the plots and the best trial's configuration, and say where they are."""
+    from sb3_tbc.tune import results as reports
+    from sb3_tbc.tune.study import ORIGIN
+
+    reports.write_table(study, folder / "trials.csv")
+    print(f"trials         {folder / 'trials.csv'}")
+    for path in reports.write_plots(study, folder):
+        print(f"plot           {path}")
+    done = reports.complete_trials(study)
+    if not done:
+        print("best           (no complete trial yet)")
+        return
+    for trial in done:
+        if trial.user_attrs.get(ORIGIN):
+            print(f"{trial.user_attrs[ORIGIN]:<14} {settings.objective} {trial.value:.4g}   (trial {trial.number})")
+    best = study.best_trial
+    path = reports.write_trial(settings, best, study.study_name, folder / "best.yml")
+    if len(done) > 1 and len({trial.value for trial in done}) == 1:
+        print(f"note           all {len(done)} trials have the same value; a larger --n-timesteps may tell them apart")
+    print(f"best           {settings.objective} {best.value:.4g}   (trial {best.number})")
+    print(f"settings       {path}")
+    print(f"its curve      {shlex.join(['python', '-m', 'sb3_tbc.train', *train_arguments(settings, path)])}")
+
+
+def train_arguments(settings: StudySettings, path: Path, seed: int | None = None) -> list[str]:
+    """Arguments of the training command that repeats a trial's first seed."""
+    seed = settings.first_seed if seed is None else seed
+    arguments = ["--algo", settings.algo, "--env", settings.env, "--config", str(path), "--seed", str(seed)]
+    arguments += ["--eval-freq", str(settings.eval_freq), "--n-eval-episodes", str(settings.n_eval_episodes)]
+    return [*arguments, "--variant", path.stem]
+
+
+def train_from(args: argparse.Namespace, study: Study, settings: StudySettings, folder: Path) -> int:
+    """Write a trial's configuration and train on it."""
+    from sb3_tbc import train
+    from sb3_tbc.tune.results import find_trial, write_trial
+
+    trial = find_trial(study, args.trial)
+    path = write_trial(settings, trial, study.study_name, folder / f"trial_{trial.number:04d}.yml")
+    print(f"settings       {path}   (trial {trial.number})", flush=True)
+    arguments = train_arguments(settings, path, args.seed)
+    arguments += ["--log-folder", str(folder / "train"), "--device", args.device]
+    arguments += ["--n-timesteps", str(args.n_timesteps)] if args.n_timesteps else []
+    return train.command([*arguments, *(["--overwrite"] if args.overwrite else [])])
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    return run_command(command, "sb3_tbc.tune", argv)

@@ -1,0 +1,382 @@
+"""What a search varies: ranges read from YAML, turned into a trial's suggestions and those into a configuration.
+
+Nothing here imports Optuna: a space is data, and a trial is whatever has ``suggest_float`` and its sisters.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, Protocol
+
+import yaml
+
+from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.tbc_hrl.config import DEFAULT_WIRING, LEVEL_DEFAULTS
+from sb3_tbc.zoo.algorithms import algorithm
+from sb3_tbc.zoo.config import RunConfig, merge
+from sb3_tbc.zoo.schema import RUN, SECTION, coerce, validate
+
+Values = dict[str, Any]
+"""Parameter name -> value, as a trial holds it."""
+
+SCHEDULE = "learning_rate_schedule"
+"""The one parameter that sets nothing itself: with ``linear`` the searched learning rates fall to zero."""
+SCHEDULES = ("constant", "linear")
+FIELDS = ("low", "high", "log", "step", "choices", "keys", "when")
+CIRCUIT = "low.policy_kwargs.ndbc"
+SUB_STEPS = 3
+"""K where a circuit does not say it, as in :class:`~sb3_tbc.ndbc.NDBCNet`."""
+
+
+class Suggests(Protocol):
+    """The part of ``optuna.Trial`` that a space needs."""
+
+    def suggest_float(self, name: str, low: float, high: float, *, step: float | None, log: bool) -> float:
+        """Return a number."""
+
+    def suggest_int(self, name: str, low: int, high: int, *, step: int, log: bool) -> int:
+        """Return a whole number."""
+
+    def suggest_categorical(self, name: str, choices: Sequence[Any]) -> Any:
+        """Return one of the choices."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One searched quantity.
+
+    :param name: as the study shows it
+    :param keys: dotted keys of the configuration that get the value
+    :param low: lower end of a range, inclusive; whole if both ends are
+    :param high: upper end
+    :param log: sample the logarithm uniformly
+    :param step: spacing, None for none
+    :param choices: labels instead of a range
+    :param sets: label -> dotted keys and their values, where a label stands for something else than itself
+    :param when: only if another parameter has this value
+    """
+
+    name: str
+    keys: tuple[str, ...]
+    low: float = 0.0
+    high: float = 0.0
+    log: bool = False
+    step: float | None = None
+    choices: tuple[Any, ...] = ()
+    sets: Mapping[Any, Mapping[str, Any]] = field(default_factory=dict)
+    when: tuple[str, Any] | None = None
+
+    @property
+    def whole(self) -> bool:
+        """Whether the range is one of whole numbers."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+    def suggest(self, trial: Suggests) -> Any:
+        """Let a trial choose."""
+        if self.choices:
+            return trial.suggest_categorical(self.name, self.choices)
+        if self.whole:
+            return trial.suggest_int(self.name, int(self.low), int(self.high), step=int(self.step or 1), log=self.log)
+        return trial.suggest_float(self.name, self.low, self.high, step=self.step, log=self.log)
+
+    def settings(self, value: Any) -> Values:
+        """Dotted configuration keys for a value."""
+        return dict(self.sets[value]) if self.sets else dict.fromkeys(self.keys, value)
+
+    def holds(self, value: Any) -> bool:
+        """Whether a value lies in the range or among the choices."""
+        if self.choices:
+            return value in self.choices
+        if isinstance(value, bool) or not isinstance(value, int | float) or not self.low <= value <= self.high:
+            return False
+        return not self.whole or (float(value).is_integer() and (value - self.low) % int(self.step or 1) == 0)
+
+    def read(self, run: RunConfig) -> Any:
+        """The value that would give a configuration its settings, None if there is none."""
+        if self.name == SCHEDULE:
+            rates = [read_key(run, f"{level}.learning_rate") for level in ("low", "high")]
+            return SCHEDULES[any(isinstance(rate, str) and rate.startswith("lin_") for rate in rates)]
+        if self.sets:
+            by_size = sorted(self.sets.items(), key=lambda item: -len(item[1]))
+            fits = (label for label, s in by_size if all(_same(read_key(run, k), v) for k, v in s.items()))
+            return next(fits, None)
+        found = [_plain(read_key(run, key)) for key in self.keys]
+        return found[0] if found and all(value == found[0] for value in found) else None
+
+
+Space = tuple[Parameter, ...]
+
+
+def _same(value: Any, wanted: Any) -> bool:
+    """Equality, where ``auto_0.4`` (automatic from a start value) counts as ``auto``."""
+    return bool(value == wanted) or (wanted == "auto" and str(value).startswith("auto"))
+
+
+def _plain(value: Any) -> Any:
+    """A learning rate's start value; whatever else it is, itself."""
+    return float(value.removeprefix("lin_")) if isinstance(value, str) and value.startswith("lin_") else value
+
+
+def read_key(run: RunConfig, key: str) -> Any:
+    """A configuration's value of a dotted key, or what the agent takes where the configuration says nothing."""
+    first, *rest = key.split(".")
+    value: Any = run.env_kwargs if first == "env_kwargs" else getattr(run, first) if first in RUN else None
+    value = run.model.get(first) if first not in RUN else value
+    for name in rest:
+        value = value.get(name) if isinstance(value, Mapping) else None
+    if value is None and len(rest) == 1 and first in ("low", "high"):
+        value = run.model.get(rest[0], LEVEL_DEFAULTS.get(rest[0]))
+    if value is None and not rest and first not in run.model:
+        known = inspect.signature(algorithm(run.algo)).parameters
+        value = known[first].default if first in known else None
+    return value
+
+
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """``{"low.tau": 1}`` as ``{"low": {"tau": 1}}``."""
+    result: dict[str, Any] = {}
+    for key, value in settings.items():
+        for name in reversed(key.split(".")):
+            value = {name: value}
+        result = merge(result, value)
+    return result
+
+
+# --------------------------------------------------------------------------------------------- reading
+
+
+def space_file(algo: str) -> Path:
+    """The shipped search space of an algorithm.
+
+    :raises ConfigError: if there is none
+    """
+    folder = Path(str(resources.files("sb3_tbc.zoo_configs"))) / "search"
+    path = folder / f"{algo}.yml"
+    if not path.is_file():
+        raise ConfigError(f"no search space for {algo!r}; {nearest(algo, (p.stem for p in folder.glob('*.yml')))}")
+    return path
+
+
+def read_sections(path: Path) -> dict[str, dict[str, Any]]:
+    """Read a search-space file.
+
+    :raises ConfigError: if it cannot be read or is not sections of parameters
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, yaml.YAMLError) as error:
+        raise ConfigError(f"cannot read search space {path}: {error}") from error
+    if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
+        raise ConfigError(f"{path}: expected sections of parameters (default and one per task)")
+    sections: dict[str, dict[str, Any]] = coerce(data)
+    return sections
+
+
+def load_space(algo: str, task: str, extra: Path | None = None) -> dict[str, dict[str, Any]]:
+    """The declaration of a search: shipped default -> shipped task -> the user's default -> the user's task.
+
+    :param extra: the user's file; a parameter set to ``null`` is not searched
+    :return: parameter name -> its fields, plain data that a study can keep
+    :raises ConfigError: for a mistake in a file
+    """
+    merged: dict[str, Any] = {}
+    for path in (space_file(algo), extra):
+        sections = read_sections(path) if path is not None else {}
+        for name in ("default", task):
+            for parameter, fields in sections.get(name, {}).items():
+                merged[parameter] = _over(merged.get(parameter), fields)
+    space = {name: fields for name, fields in merged.items() if fields is not None}
+    build_space(space)
+    return space
+
+
+def _over(old: Any, new: Any) -> Any:
+    """Lay a parameter's fields over earlier ones; a range replaces choices and the other way round."""
+    if not isinstance(old, Mapping) or not isinstance(new, Mapping):
+        return new
+    dropped = ("low", "high", "log", "step") if "choices" in new else ("choices",) if "low" in new else ()
+    return {**{key: value for key, value in old.items() if key not in dropped}, **new}
+
+
+def build_space(declared: Mapping[str, Mapping[str, Any]]) -> Space:
+    """Parameters from their declaration.
+
+    :raises ConfigError: naming the parameter and what is wrong with it
+    """
+    space: list[Parameter] = []
+    for name, fields in declared.items():
+        parameter = _parameter(name, fields)
+        if parameter.when and parameter.when[0] not in {p.name for p in space}:
+            raise ConfigError(f"search parameter {name}: 'when' must name a parameter above it, got {fields['when']!r}")
+        space.append(parameter)
+    return tuple(space)
+
+
+def _parameter(name: str, fields: Any) -> Parameter:
+    where = f"search parameter {name}"
+    if not isinstance(fields, Mapping):
+        raise ConfigError(f"{where} must have fields like low and high, got {fields!r}")
+    for key in fields:
+        if key not in FIELDS:
+            raise ConfigError(f"{where}: unknown field {key!r}; {nearest(str(key), FIELDS)}")
+    keys = tuple(fields.get("keys") or ((name,) if name != SCHEDULE else ()))
+    when = fields.get("when")
+    if when is not None and not (isinstance(when, Mapping) and len(when) == 1):
+        raise ConfigError(f"{where}: 'when' is one parameter and its value, got {when!r}")
+    condition = next(iter(when.items())) if when else None
+    choices = fields.get("choices")
+    if choices is not None:
+        return _choice(name, keys, choices, condition, where)
+    low, high, log, step = (fields.get(key) for key in ("low", "high", "log", "step"))
+    if not isinstance(low, int | float) or not isinstance(high, int | float) or not low <= high:
+        raise ConfigError(f"{where} needs low and high with low <= high, or choices, got {dict(fields)}")
+    if log and low <= 0:
+        raise ConfigError(f"{where}: a logarithmic range must begin above 0, got {low}")
+    if log and step:
+        raise ConfigError(f"{where}: log and step exclude each other")
+    parameter = Parameter(name, keys, low, high, bool(log), step, when=condition)
+    _check_keys(parameter, low, where)
+    return parameter
+
+
+def _choice(name: str, keys: tuple[str, ...], choices: Any, when: tuple[str, Any] | None, where: str) -> Parameter:
+    sets = choices if isinstance(choices, Mapping) else {}
+    labels = tuple(choices) if isinstance(choices, Mapping | list) else ()
+    if not labels or not all(isinstance(label, str | int | float | bool) for label in labels):
+        raise ConfigError(f"{where}: choices are a list of values, or labels and what they set, got {choices!r}")
+    if name == SCHEDULE and not set(labels) <= set(SCHEDULES):
+        raise ConfigError(f"{where} must be among {', '.join(SCHEDULES)}, got {list(labels)}")
+    parameter = Parameter(name, keys, choices=labels, sets={k: dict(v or {}) for k, v in sets.items()}, when=when)
+    for label in labels:
+        _check_keys(parameter, label, where)
+    return parameter
+
+
+def _check_keys(parameter: Parameter, value: Any, where: str) -> None:
+    if parameter.name != SCHEDULE:
+        validate(nested(parameter.settings(value)), SECTION, where)
+
+
+def restrict(
+    declared: Mapping[str, Mapping[str, Any]], run: RunConfig, patterns: Iterable[str], fixed: Mapping[str, Any]
+) -> dict[str, dict[str, Any]]:
+    """Leave out what is not to be searched or can have no effect.
+
+    :param declared: the whole space
+    :param run: configuration that all other settings come from
+    :param patterns: names to search, with ``*`` and ``?``; none for all
+    :param fixed: settings of the command line (nested): what they set is not searched
+    :raises ConfigError: if a pattern matches nothing, or nothing is left
+    """
+    wanted = list(patterns)
+    for pattern in wanted:
+        if not fnmatch.filter(declared, pattern):
+            raise ConfigError(f"--search {pattern!r} matches no parameter; {nearest(pattern, declared)}")
+    space = {p.name: p for p in build_space(declared)}
+    idle = _idle_keys(run)
+    left: dict[str, dict[str, Any]] = {}
+    for name, parameter in space.items():
+        keys = tuple(key for key in parameter.keys if not _is_set(fixed, key))
+        without = (parameter.keys and not keys) or any(_is_set(fixed, k) for s in parameter.sets.values() for k in s)
+        if without or (wanted and not any(fnmatch.fnmatch(name, pattern) for pattern in wanted)):
+            continue
+        if any(key.startswith(idle) for key in keys):
+            continue
+        fields = dict(declared[name])
+        if parameter.when and parameter.when[0] not in left:
+            if space[parameter.when[0]].read(run) != parameter.when[1]:
+                continue
+            del fields["when"]
+        left[name] = {**fields, **({"keys": list(keys)} if parameter.keys else {})}
+    if not left:
+        raise ConfigError("nothing is left to search: --search and --hyperparams leave out every parameter")
+    return left
+
+
+def _idle_keys(run: RunConfig) -> tuple[str, ...]:
+    """Beginnings of keys that change nothing: a circuit where there is none, the rule's scale where nobody asks it."""
+    idle = [] if read_key(run, CIRCUIT) is not None else [CIRCUIT]
+    if read_key(run, "duration") != "rule" and not read_key(run, "duration_loss_coef"):
+        idle.append("kappa")
+    return tuple(idle)
+
+
+def _is_set(settings: Mapping[str, Any], key: str) -> bool:
+    value: Any = settings
+    for name in key.split("."):
+        if not isinstance(value, Mapping) or name not in value:
+            return False
+        value = value[name]
+    return True
+
+
+# --------------------------------------------------------------------------------------------- using
+
+
+def suggest(space: Space, trial: Suggests, only: Iterable[str] | None = None) -> Values:
+    """Let a trial choose every parameter whose condition holds.
+
+    :param only: names to choose; by default all
+    """
+    allowed = None if only is None else set(only)
+    values: Values = {}
+    for parameter in space:
+        if parameter.when and values.get(parameter.when[0]) != parameter.when[1]:
+            continue
+        if allowed is None or parameter.name in allowed:
+            values[parameter.name] = parameter.suggest(trial)
+    return values
+
+
+def project(space: Space, run: RunConfig) -> Values:
+    """A configuration as values of the space; values outside of their range are left out."""
+    values: Values = {}
+    for parameter in space:
+        if parameter.when and values.get(parameter.when[0]) != parameter.when[1]:
+            continue
+        value = parameter.read(run)
+        if value is not None and parameter.holds(value):
+            values[parameter.name] = int(value) if parameter.whole and not parameter.choices else value
+    return values
+
+
+def apply(space: Space, values: Mapping[str, Any], run: RunConfig) -> RunConfig:
+    """A configuration with a trial's values laid over it.
+
+    :raises ConfigError: if a value is of the wrong kind
+    """
+    settings: Values = {}
+    for parameter in space:
+        if parameter.name in values and parameter.name != SCHEDULE:
+            settings.update(parameter.settings(values[parameter.name]))
+    if SCHEDULE in values:
+        for key in ("low.learning_rate", "high.learning_rate"):
+            rate = _plain(settings.get(key, read_key(run, key)))
+            settings[key] = f"lin_{rate!r}" if values[SCHEDULE] == "linear" else rate
+    change = validate(nested(settings), SECTION, "trial")
+    in_run = {key: change.pop(key) for key in RUN if key in change}
+    if "env_kwargs" in in_run:
+        in_run["env_kwargs"] = merge(run.env_kwargs, in_run["env_kwargs"])
+    return replace(run, model=merge(run.model, change), **in_run)
+
+
+def complete(run: RunConfig, action_dim: int) -> RunConfig:
+    """A configuration in which the circuit is written out where the agent would take its default one.
+
+    A task without a section has none; a trial that changed one size only would leave the others out.
+
+    :param action_dim: size of the task's actions, which is the default number of motor neurons
+    """
+    low = run.model.get("low") or {}
+    policy_kwargs = low.get("policy_kwargs") or {}
+    has_default = getattr(algorithm(run.algo), "default_circuit", False)
+    circuit = policy_kwargs.get("ndbc", {}) if has_default else policy_kwargs.get("ndbc")
+    if circuit is None:
+        return run
+    written = {**DEFAULT_WIRING, "motor": action_dim, "sub_steps": SUB_STEPS, **circuit}
+    return replace(run, model=merge(run.model, {"low": {"policy_kwargs": {"ndbc": written}}}))

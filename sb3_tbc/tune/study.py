@@ -1,0 +1,351 @@
+"""Where a search lives: storages with a heartbeat, studies that know what they compare, samplers by name."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import re
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import optuna
+from optuna.storages import BaseStorage, RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
+from optuna.storages._heartbeat import BaseHeartbeat
+from optuna.storages.journal import JournalFileBackend, JournalStorage
+from optuna.study import Study
+from optuna.trial import FrozenTrial, TrialState
+
+from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.tune.objectives import OBJECTIVES
+from sb3_tbc.tune.search_space import Space, Values, apply, build_space, project
+from sb3_tbc.zoo.config import RunConfig
+
+SETTINGS = "settings"
+"""Study attribute with :class:`StudySettings`."""
+ORIGIN = "origin"
+"""Trial attribute of the first trials: which configuration it is, ``paper``, ``tuned`` or ``default``."""
+REASON = "reason"
+"""Trial attribute: why a trial was given up."""
+WORKER = "worker"
+"""Trial attribute: who runs it."""
+COUNTED = (TrialState.COMPLETE, TrialState.PRUNED)
+"""States of trials that are done; a failed trial is not, because it is run again."""
+MAX_RETRIES = 3
+JOURNAL_SUFFIXES = (".log", ".journal")
+Retry = Callable[[Study, FrozenTrial], None]
+
+optuna.logging.set_verbosity(optuna.logging.ERROR)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Optuna calls "experimental" what has been there for years."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        yield
+
+
+@dataclass(frozen=True)
+class StudySettings:
+    """What all trials of a study share. It is stored with the study, so a resumed search compares like with like.
+
+    :param algo: algorithm
+    :param env: environment as the user named it (``module:id`` imports the module first)
+    :param task: its short name
+    :param env_id: its id
+    :param base: configuration (as plain data) that everything not searched comes from
+    :param baselines: name -> configuration of the first trials
+    :param space: declaration of the search space
+    :param n_seeds: training runs per trial
+    :param first_seed: their seeds are ``first_seed, first_seed + 1, ...``, the same in every trial
+    :param objective: one of :data:`~sb3_tbc.tune.objectives.OBJECTIVES`
+    :param across_seeds: ``mean`` or ``median``
+    :param threshold: success rate that ``steps-to-success`` waits for
+    :param eval_freq: environment steps between evaluations
+    :param n_eval_episodes: episodes of each
+    :param n_final_episodes: episodes of the evaluation after training
+    :param asked: the command-line options that led to this, by which a resuming command is checked
+    """
+
+    algo: str
+    env: str
+    task: str
+    env_id: str
+    base: dict[str, Any]
+    baselines: dict[str, dict[str, Any]]
+    space: dict[str, dict[str, Any]]
+    n_seeds: int
+    first_seed: int
+    objective: str
+    across_seeds: str
+    threshold: float
+    eval_freq: int
+    n_eval_episodes: int
+    n_final_episodes: int
+    asked: dict[str, Any]
+
+    @property
+    def run(self) -> RunConfig:
+        """The configuration that trials depart from."""
+        return RunConfig.from_dict(self.base)
+
+    @property
+    def parameters(self) -> Space:
+        """The search space."""
+        return build_space(self.space)
+
+    @property
+    def seeds(self) -> range:
+        """Training seeds of every trial."""
+        return range(self.first_seed, self.first_seed + self.n_seeds)
+
+    @property
+    def n_evaluations(self) -> int:
+        """Evaluations of one training run, and one to spare: several environments overshoot by a step or two."""
+        return self.run.n_timesteps // self.eval_freq + 1
+
+    @property
+    def direction(self) -> Literal["minimize", "maximize"]:
+        """Whether the objective is to grow or to fall."""
+        return OBJECTIVES[self.objective].direction
+
+    def first_trials(self) -> dict[str, Values]:
+        """Parameter values of the baselines."""
+        return {name: project(self.parameters, RunConfig.from_dict(run)) for name, run in self.baselines.items()}
+
+    def config_of(self, trial: FrozenTrial) -> RunConfig:
+        """The configuration of a trial; a baseline's is its own, not only what the space can say of it."""
+        return self.config_of_values(trial.user_attrs.get(ORIGIN), trial.params)
+
+    def config_of_values(self, origin: str | None, values: Values) -> RunConfig:
+        """The configuration of a baseline, or of a trial with these values."""
+        if origin in self.baselines:
+            return RunConfig.from_dict(self.baselines[origin])
+        return apply(self.parameters, values, self.run)
+
+
+class JournalWithHeartbeat(JournalStorage, BaseHeartbeat):
+    """A journal file whose running trials show signs of life, as Optuna's databases do; its own journal has none.
+
+    A sign of life is the time of a small file beside the journal, so it costs no line in it. Ages are taken from the
+    file system's clock.
+
+    :param path: the journal
+    :param interval: seconds between signs of life
+    :param grace: seconds after which a trial without one is given to another worker
+    :param callback: called with such a trial
+    """
+
+    def __init__(self, path: Path, interval: int, grace: int, callback: Retry) -> None:
+        super().__init__(JournalFileBackend(str(path)))
+        self._folder = path.with_name(path.name + ".alive")
+        self._folder.mkdir(exist_ok=True)
+        self._interval, self._grace, self._callback = interval, grace, callback
+
+    def record_heartbeat(self, trial_id: int) -> None:
+        """Say that a trial's worker lives."""
+        (self._folder / f"trial_{trial_id}").touch()
+
+    def _get_stale_trial_ids(self, study_id: int) -> list[int]:
+        running = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
+        if not running:
+            return []
+        clock = self._folder / "clock"
+        clock.touch()
+        now = clock.stat().st_mtime
+        return [t._trial_id for t in running if now - self._last_sign(t) > self._grace]
+
+    def _last_sign(self, trial: FrozenTrial) -> float:
+        try:
+            return (self._folder / f"trial_{trial._trial_id}").stat().st_mtime
+        except FileNotFoundError:
+            return (trial.datetime_start or datetime.datetime.now()).timestamp()
+
+    def get_heartbeat_interval(self) -> int:
+        """Seconds between signs of life."""
+        return self._interval
+
+    def get_heartbeat_stale_trial_callback(self) -> Retry:
+        """Return what retries a dead worker's trial."""
+        return self._callback
+
+
+def is_url(storage: str) -> bool:
+    """Whether a storage is a database rather than a journal file."""
+    return "://" in storage
+
+
+def shown(storage: str) -> str:
+    """A storage's name without its password, wherever it stands, in a mistyped URL too."""
+    begin, slashes, rest = storage.partition("//")
+    account, at, host = rest.rpartition("@")
+    host = re.sub(r"(password=)[^&]*", r"\1***", host)
+    return f"{begin}{slashes}{account.partition(':')[0]}{':***' if ':' in account else ''}{at}{host}"
+
+
+def open_storage(storage: str, grace: int = 120) -> BaseStorage:
+    """Open a journal file (created with its folder) or a database, with a heartbeat either way.
+
+    :param storage: path ending in ``.log`` or ``.journal``, or a URL like ``postgresql+psycopg://user@host/name``
+    :param grace: seconds without a sign of life after which a trial is given to another worker
+    :raises ConfigError: if it cannot be opened, without the password
+    """
+    try:
+        with _quiet():
+            return _open(storage, grace)
+    except ConfigError:
+        raise
+    except Exception as error:  # drivers raise what they like; anything here is a storage that cannot be opened
+        raise ConfigError(f"cannot open storage {shown(storage)}: {_first_line(error, storage)}") from error
+
+
+def _open(storage: str, grace: int) -> BaseStorage:
+    retry, interval = RetryHeartbeatStaleTrialCallback(max_retry=MAX_RETRIES), max(1, grace // 4)
+    if is_url(storage):
+        database = RDBStorage(
+            storage,
+            engine_kwargs={"pool_pre_ping": True},
+            heartbeat_interval=interval,
+            grace_period=grace,
+            heartbeat_stale_trial_callback=retry,
+        )
+        return optuna.storages.get_storage(database)
+    path = Path(storage)
+    if path.suffix not in JOURNAL_SUFFIXES:
+        raise ConfigError(
+            f"storage must be a journal file ending in {' or '.join(JOURNAL_SUFFIXES)}, or a URL like "
+            f"sqlite:///study.db or postgresql+psycopg://user@host/name; got {shown(storage)!r}"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return JournalWithHeartbeat(path, interval, grace, retry)
+
+
+def _first_line(error: Exception, storage: str) -> str:
+    """A driver's message in short; it may quote the whole URL."""
+    text = str(error).replace(storage, shown(storage)).strip() or type(error).__name__
+    return text.splitlines()[0][:300]
+
+
+def names(storage: BaseStorage) -> set[str]:
+    """Names of the studies in a storage."""
+    return set(optuna.get_all_study_names(storage))
+
+
+def open_study(
+    storage: BaseStorage, name: str, where: str, wanted: StudySettings | None, asked: Mapping[str, Any]
+) -> tuple[Study, StudySettings]:
+    """Load the study of this name, or create it with its first trials queued.
+
+    :param where: the storage's name, for messages
+    :param wanted: settings of a new study; None to load only
+    :param asked: the options given now; those of an existing study must agree
+    :raises ConfigError: if there is none to load, or it is of something else
+    """
+    known = names(storage)
+    if name not in known:
+        if wanted is None:
+            there = f"; {nearest(name, known)}" if known else "; it holds no study yet"
+            raise ConfigError(f"no study {name!r} in {where}{there}")
+        with contextlib.suppress(optuna.exceptions.DuplicatedStudyError):  # another machine was faster
+            study = optuna.create_study(storage=storage, study_name=name, direction=wanted.direction)
+            study.set_user_attr(SETTINGS, asdict(wanted))
+    study = optuna.load_study(study_name=name, storage=storage)
+    _wait_for_settings(study)
+    settings = read_settings(study)
+    check_same(settings, name, asked)
+    queue_first_trials(study, settings)
+    return study, settings
+
+
+def _wait_for_settings(study: Study) -> None:
+    """A study without trials and settings is being created by another machine this very moment."""
+    for _ in range(200):
+        if SETTINGS in study.user_attrs or study.get_trials(deepcopy=False):
+            return
+        time.sleep(0.1)
+
+
+def read_settings(study: Study) -> StudySettings:
+    """What a study's trials share.
+
+    :raises ConfigError: if this command did not make the study
+    """
+    data = study.user_attrs.get(SETTINGS)
+    try:
+        return StudySettings(**data)  # type: ignore[arg-type]
+    except TypeError as error:
+        raise ConfigError(f"study {study.study_name!r} was not made by this command or version") from error
+
+
+def check_same(settings: StudySettings, name: str, asked: Mapping[str, Any]) -> None:
+    """Refuse options that would make a study's trials incomparable.
+
+    :raises ConfigError: naming the option and both values
+    """
+    cure = "continue it with its own options, or begin another with --study-name"
+    begun = {**settings.asked, "algo": settings.algo, "env": settings.task}
+    for option, value in asked.items():
+        if value is not None and begun.get(option) != value:
+            kind = "is of another algorithm" if option == "algo" else "was begun with other options"
+            flag = f"--{option.replace('_', '-')}"
+            raise ConfigError(f"study {name!r} {kind}: {flag} is {begun.get(option)} there, not {value}; {cure}")
+
+
+def queue_first_trials(study: Study, settings: StudySettings) -> None:
+    """Queue the baselines that are neither done, nor running, nor queued."""
+    trials = study.get_trials(deepcopy=False)
+    there = {t.user_attrs.get(ORIGIN) for t in trials if t.state != TrialState.FAIL}
+    for origin, values in settings.first_trials().items():
+        if origin not in there:
+            study.enqueue_trial(values, user_attrs={ORIGIN: origin})
+
+
+def count_done(study: Study) -> int:
+    """Trials that are complete or pruned; a failed trial and its retry are one."""
+    return len(study.get_trials(deepcopy=False, states=COUNTED))
+
+
+def retire_stale(study: Study) -> None:
+    """Give the trials of dead workers back to the queue."""
+    with _quiet():
+        fail_stale_trials(study)
+
+
+def requeue(study: Study, trial: FrozenTrial) -> None:
+    """Put a trial that the user stopped back into the queue, with the seeds it has finished."""
+    with _quiet():
+        RetryHeartbeatStaleTrialCallback(max_retry=None)(study, trial)
+
+
+# --------------------------------------------------------------------------------------------- samplers
+
+
+def make_sampler(name: str, seed: int | None, stream: tuple[int, ...] = ()) -> optuna.samplers.BaseSampler:
+    """A sampler by name: ``tpe``, ``random``, or any class of ``optuna.samplers``.
+
+    TPE is multivariate, keeps conditional parameters apart, and does not crowd around trials that still run.
+
+    :param seed: with ``stream`` (worker, trials so far) it gives every worker and every resumption its own numbers
+    :raises ConfigError: for an unknown name or one that needs arguments or a package
+    """
+    known = {n.removesuffix("Sampler").lower(): n for n in optuna.samplers.__all__ if n.endswith("Sampler")}
+    known.pop("base", None)
+    key = name.removesuffix("Sampler").lower()
+    if key not in known or key.startswith("base"):
+        raise ConfigError(f"unknown sampler {name!r}; {nearest(key, known)}")
+    options: dict[str, Any] = {}
+    if seed is not None:
+        options["seed"] = int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0])
+    if key == "tpe":
+        options.update(multivariate=True, group=True, constant_liar=True)
+    try:
+        with _quiet():
+            sampler: optuna.samplers.BaseSampler = getattr(optuna.samplers, known[key])(**options)
+    except (TypeError, ImportError) as error:
+        raise ConfigError(f"sampler {name!r} cannot be used by name: {error}; use tpe or random") from error
+    return sampler

@@ -1,0 +1,245 @@
+"""Watching a run: success evaluations with a CSV record, the trace of options, checkpoints by the clock."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import time
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, EventCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+
+
+class EvaluationRow(NamedTuple):
+    """One line of ``evaluations.csv``; lengths and windows in environment steps, wall time in seconds."""
+
+    timesteps: int
+    success_rate: float
+    episodes: int
+    mean_length: float
+    subgoal_success: float
+    mean_window: float
+    wall_time: float
+
+
+def write_evaluations(path: Path, rows: Iterable[EvaluationRow]) -> None:
+    """Write ``evaluations.csv`` whole; it is small, and so a crash leaves the old one or the new one."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(EvaluationRow._fields)
+    writer.writerows([f"{value:.6g}" if isinstance(value, float) else value for value in row] for row in rows)
+    write_atomic(path, text.getvalue())
+
+
+def read_evaluations(path: Path) -> list[EvaluationRow]:
+    """Read ``evaluations.csv``; a missing file is no evaluations.
+
+    :raises ValueError: if the file has other columns
+    """
+    if not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        if tuple(reader.fieldnames or ()) != EvaluationRow._fields:
+            raise ValueError(
+                f"{path} must have the columns {', '.join(EvaluationRow._fields)}, got {reader.fieldnames}"
+            )
+        return [_parse_row(row) for row in reader]
+
+
+def _parse_row(row: dict[str, str]) -> EvaluationRow:
+    values = {name: float(text) for name, text in row.items()}
+    steps, episodes = int(values.pop("timesteps")), int(values.pop("episodes"))
+    return EvaluationRow(timesteps=steps, episodes=episodes, **values)
+
+
+def finite_mean(values: Any) -> float:
+    """Mean of the finite values, NaN if there is none (an episode without a finished window has no window length)."""
+    array = np.asarray(values, dtype=np.float64)
+    array = array[np.isfinite(array)]
+    return float(array.mean()) if array.size else float("nan")
+
+
+class SuccessEvalCallback(EventCallback):
+    """Evaluates the deterministic agent every ``eval_freq`` environment steps and keeps the best by success rate.
+
+    SB3's ``EvalCallback`` keeps the best by mean reward, which says little on sparse tasks and nothing of subgoals.
+
+    :param eval_env: one or several environments of their own, not those of training
+    :param eval_freq: environment steps between evaluations (all environments counted)
+    :param n_eval_episodes: episodes per evaluation
+    :param seed: evaluation ``k`` runs on seed ``seed + 1000 k``, whatever training does
+    :param csv_path: where the rows go, rewritten after each evaluation; rows already there are continued
+    :param best_model_path: where the best agent is saved; of equals, the one with shorter episodes
+    :param wall_time: seconds that earlier parts of a resumed run took
+    :param callback_on_new_best: called after a new best was saved
+    :param callback_after_eval: called after each evaluation; returning ``False`` stops training
+    """
+
+    def __init__(
+        self,
+        eval_env: VecEnv,
+        eval_freq: int = 5000,
+        n_eval_episodes: int = 20,
+        seed: int = 0,
+        csv_path: Path | None = None,
+        best_model_path: Path | None = None,
+        wall_time: float = 0.0,
+        callback_on_new_best: BaseCallback | None = None,
+        callback_after_eval: BaseCallback | None = None,
+        verbose: int = 0,
+    ) -> None:
+        super().__init__(callback_after_eval, verbose=verbose)
+        if eval_freq < 1 or n_eval_episodes < 1:
+            raise ValueError(f"eval_freq and n_eval_episodes must be at least 1, got {eval_freq} and {n_eval_episodes}")
+        self.eval_env = eval_env
+        self.eval_freq = eval_freq
+        self.n_eval_episodes = n_eval_episodes
+        self.seed = seed
+        self.csv_path = csv_path
+        self.best_model_path = best_model_path
+        self.callback_on_new_best = callback_on_new_best
+        self.rows = read_evaluations(csv_path) if csv_path else []
+        self._earlier = wall_time
+        self._started = time.monotonic()
+
+    def init_callback(self, model: BaseAlgorithm) -> None:
+        """Hand the model to the inner callbacks too."""
+        super().init_callback(model)
+        if self.callback_on_new_best is not None:
+            self.callback_on_new_best.parent = self
+            self.callback_on_new_best.init_callback(model)
+
+    @property
+    def wall_time(self) -> float:
+        """Seconds since the run began, evaluations included, earlier parts of a resumed run too."""
+        return self._earlier + time.monotonic() - self._started
+
+    def _on_step(self) -> bool:
+        done = self.rows[-1].timesteps if self.rows else 0
+        if self.num_timesteps // self.eval_freq <= done // self.eval_freq:
+            return True
+        self.evaluate()
+        return self._on_event()
+
+    def evaluate(self) -> EvaluationRow:
+        """Evaluate now, record the row, keep the agent if it is the best."""
+        if not isinstance(self.model, (TBCHRL, FlatSAC)):
+            raise TypeError(f"SuccessEvalCallback evaluates this package's agents, got {type(self.model).__name__}")
+        result = evaluate_agent(
+            self.model, self.eval_env, self.n_eval_episodes, seed=self.seed + 1000 * len(self.rows), deterministic=True
+        )
+        row = EvaluationRow(
+            timesteps=int(self.num_timesteps),
+            success_rate=finite_mean(result.successes),
+            episodes=len(result.successes),
+            mean_length=finite_mean(result.lengths),
+            subgoal_success=finite_mean(result.subgoal_success),
+            mean_window=finite_mean(result.mean_window),
+            wall_time=self.wall_time,
+        )
+        is_best = not self.rows or _quality(row) > max(map(_quality, self.rows))
+        self.rows.append(row)
+        self._record(row, is_best)
+        return row
+
+    def _record(self, row: EvaluationRow, is_best: bool) -> None:
+        for name in ("success_rate", "mean_length", "subgoal_success", "mean_window"):
+            self.logger.record(f"eval/{name}", getattr(row, name))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+        if self.csv_path is not None:
+            write_evaluations(self.csv_path, self.rows)
+        if is_best and self.best_model_path is not None:
+            save_atomic(self.model.save, self.best_model_path)
+        if is_best and self.callback_on_new_best is not None:
+            self.callback_on_new_best.on_step()
+        if self.verbose:
+            options = f", subgoals reached {row.subgoal_success:.2f}, window {row.mean_window:.1f} steps"
+            print(
+                f"{row.timesteps:>9,} steps: success {row.success_rate:.2f}, length {row.mean_length:.0f}"
+                f"{'' if math.isnan(row.mean_window) else options}"  # a flat agent has no options
+            )
+
+
+def _quality(row: EvaluationRow) -> tuple[float, float]:
+    return row.success_rate, -row.mean_length
+
+
+class OptionTraceCallback(BaseCallback):
+    """Writes every option of training to a CSV: when, where, subgoal, time budget, duration, reason of its end.
+
+    :param path: the CSV file; begun anew
+    :param every: keep one option in so many, to bound the file's size
+    """
+
+    def __init__(self, path: Path, every: int = 1, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        if every < 1:
+            raise ValueError(f"every must be at least 1, got {every}")
+        self.path = path
+        self.every = every
+        self._seen = 0
+        self._file: io.TextIOWrapper | None = None
+
+    def _on_training_start(self) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        self._file = self.path.open("w", encoding="utf-8", newline="")
+        header = ("timesteps", "env", "time_budget", "duration", "reached", "reason", "subgoal")
+        csv.writer(self._file, lineterminator="\n").writerow(header)
+
+    def _on_step(self) -> bool:
+        for index, info in enumerate(self.locals.get("infos", ())):
+            option = info.get("option")
+            if option is None:
+                continue
+            self._seen += 1
+            if self._seen % self.every == 0:
+                self._write(index, option)
+        return True
+
+    def _write(self, index: int, option: dict[str, Any]) -> None:
+        if self._file is None:
+            return
+        subgoal = " ".join(f"{x:.4g}" for x in option["subgoal"])
+        row = [self.num_timesteps, index, f"{option['time_budget']:.4g}", option["duration"]]
+        row += [int(option["reached"]), option["reason"], subgoal]
+        csv.writer(self._file, lineterminator="\n").writerow(row)
+
+    def _on_training_end(self) -> None:
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+
+class TimedCheckpointCallback(BaseCallback):
+    """Calls ``save`` every so many seconds, between rollouts, when no option is half recorded.
+
+    :param save: writes the checkpoint
+    :param seconds: shortest time between two checkpoints
+    """
+
+    def __init__(self, save: Callable[[], None], seconds: float = 600.0, verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self.save = save
+        self.seconds = seconds
+        self._last = time.monotonic()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if time.monotonic() - self._last >= self.seconds:
+            self.save()
+            self._last = time.monotonic()

@@ -1,0 +1,93 @@
+"""Videos of an agent at work, with the live subgoal and the remaining time drawn in. Needs the ``video`` extra."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.evaluation import Agent
+from sb3_tbc.tbc_hrl.policy import TwoLevelState
+
+Frame = NDArray[np.uint8]
+
+
+def episode_frames(model: Agent, env: gym.Env[Any, Any], seed: int | None = None) -> Iterator[Frame]:
+    """Frames of one deterministic episode, one per step and one at the end, each ``(height, width, 3)``.
+
+    The episode ends as in an evaluation: success, time limit, or the high level's action budget used up.
+
+    :param model: a trained agent
+    :param env: a task with ``render_mode="rgb_array"``
+    :param seed: of the reset
+    """
+    observation, _ = env.reset(seed=seed)
+    state, start, over, result = None, np.array([True]), False, "time limit"
+    overlay = getattr(env.unwrapped, "set_overlay", None)
+    while not over:
+        action, carried = model.predict(observation, state, start, deterministic=True)
+        if isinstance(model, TBCHRL) and carried is not None:
+            live = TwoLevelState(*carried)
+            if live.used[0] > model.max_options:
+                result = "action budget used up"
+                break
+            if overlay is not None:
+                left = model.rules.remaining(live.time_budget - live.elapsed + 1)
+                overlay(live.subgoal[0], float(left[0]), f"option {live.used[0]} of {model.max_options}")
+        yield _frame(env)
+        observation, _, terminated, truncated, info = env.step(action)
+        state, start = carried, np.array([False])
+        over = terminated or truncated
+        result = "success" if info.get("is_success") else result
+    if overlay is not None:
+        overlay(text=result)
+    yield _frame(env)
+
+
+def _frame(env: gym.Env[Any, Any]) -> Frame:
+    try:
+        picture: Any = env.render()
+    except Exception as error:  # An environment's own code may fail in any way.
+        cure = "" if "MUJOCO_GL" in str(error) else "; without a display, set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
+        raise ConfigError(f"the environment cannot be drawn: {error}{cure}") from error
+    if not isinstance(picture, np.ndarray):
+        raise ConfigError(f"the environment cannot be drawn: render() gave {picture!r}, not an array; see render_mode")
+    height, width = picture.shape[:2]
+    return picture[: height - height % 2, : width - width % 2]  # the codec wants even sizes
+
+
+def record_video(model: Agent, env: gym.Env[Any, Any], path: Path, n_episodes: int = 3, seed: int = 0) -> None:
+    """Record deterministic episodes to an mp4 file, which appears only when it is complete.
+
+    :param model: a trained agent
+    :param env: a task with ``render_mode="rgb_array"``
+    :param path: the file, ending in ``.mp4``
+    :param n_episodes: how many
+    :param seed: episode ``i`` starts from ``seed + i``
+    :raises ConfigError: if the file's name, the installation or the task do not allow it
+    """
+    if path.suffix != ".mp4":
+        raise ConfigError(f"a video's name must end in .mp4, got {path}")
+    try:
+        import imageio.v2 as imageio
+    except ImportError as error:
+        raise ConfigError("videos need imageio: pip install 'sb3_tbc[video]'") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
+    fps = env.metadata.get("render_fps", 30)
+    try:
+        writer: Any
+        with imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
+            for episode in range(n_episodes):
+                for frame in episode_frames(model, env, seed + episode):
+                    writer.append_data(frame)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,344 @@
+"""The flat update against Stable-Baselines3's own ``SAC.train``: same batches, same noise, same numbers."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch.fx.experimental.proxy_tensor import make_fx
+
+from sb3_tbc.level import compilation
+from sb3_tbc.level.level import SACLevel
+from sb3_tbc.level.spaces_only import SpacesOnlyVecEnv
+from sb3_tbc.level.update import FlatParameters, squash
+from sb3_tbc.replay.batch import LevelBatch
+
+OBS_DIM, ACTION_DIM, BATCH, UPDATES = 5, 2, 32, 50
+OBSERVATIONS = spaces.Box(-np.inf, np.inf, (OBS_DIM,), np.float32)
+ACTIONS = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+COMPILER = pytest.mark.skipif(compilation.compiler_problem() is not None, reason="no C++ compiler")
+
+
+def make_batches(seed: int = 0, state_dim: int = 0, updates: int = UPDATES) -> LevelBatch:
+    g = th.Generator().manual_seed(seed)
+
+    def draw(width: int) -> th.Tensor:
+        return th.randn(updates, BATCH, width, generator=g)
+
+    discounts = 0.9 + 0.1 * th.rand(updates, BATCH, 1, generator=g)
+    dones = (draw(1) > 1.0).float()
+    states = (0.3 * draw(state_dim), 0.3 * draw(state_dim))
+    return LevelBatch(draw(OBS_DIM), th.tanh(draw(ACTION_DIM)), draw(OBS_DIM), draw(1), dones, discounts, *states)
+
+
+class FixedBuffer:
+    """Hands out given batches in order, to a level as bursts, to SB3 one by one."""
+
+    def __init__(self, batches: LevelBatch) -> None:
+        self.batches, self.used = batches, 0
+
+    def sample_burst(self, gradient_steps: int, batch_size: int) -> LevelBatch:
+        start, self.used = self.used, self.used + gradient_steps
+        return LevelBatch(*(x[start : self.used, :batch_size] for x in self.batches))
+
+    def sample(self, batch_size: int, env: object = None) -> ReplayBufferSamples:
+        b = LevelBatch(*(x[0] for x in self.sample_burst(1, batch_size)))
+        return ReplayBufferSamples(b.observations, b.actions, b.next_observations, b.dones, b.rewards, b.discounts)
+
+
+def make_level(batches: LevelBatch, compile: bool | str = False, **kwargs: object) -> SACLevel:
+    arguments = {"learning_rate": 1e-3, "policy_kwargs": {"net_arch": [16, 16]}, "seed": 3, **kwargs}
+    return SACLevel("MlpPolicy", OBSERVATIONS, ACTIONS, FixedBuffer(batches), compile=compile, **arguments)
+
+
+def make_stock(level: SACLevel, **kwargs: object) -> SAC:
+    arguments = {"learning_rate": 1e-3, "policy_kwargs": {"net_arch": [16, 16]}, **kwargs}
+    stock = SAC("MlpPolicy", SpacesOnlyVecEnv(OBSERVATIONS, ACTIONS), buffer_size=1, device="cpu", **arguments)
+    stock.policy.load_state_dict({k: v for k, v in level.policy.state_dict().items() if "average" not in k})
+    stock.set_logger(Logger(folder=None, output_formats=[]))
+    return stock
+
+
+def train_stock(stock: SAC, batches: LevelBatch, noise: th.Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
+    stock.replay_buffer = FixedBuffer(batches)  # type: ignore[assignment]
+    draws = iter(noise.flatten(0, 1))
+    monkeypatch.setattr("torch.distributions.normal._standard_normal", lambda *args, **kwargs: next(draws))
+    stock.train(len(batches.rewards), BATCH)
+
+
+def level_noise(level: SACLevel, updates: int = UPDATES) -> th.Tensor:
+    """The noise that the level is about to draw."""
+    rng = np.random.default_rng(level.seed)
+    return th.from_numpy(rng.standard_normal((updates, 2, BATCH, ACTION_DIM), dtype=np.float32))
+
+
+def assert_same_policies(level: SACLevel, stock: SAC, atol: float = 1e-5) -> None:
+    theirs = stock.policy.state_dict()
+    ours = level.policy.state_dict()
+    for name, value in theirs.items():
+        assert th.allclose(ours[name], value, rtol=0, atol=atol), (name, (ours[name] - value).abs().max())
+
+
+@pytest.mark.parametrize("ent_coef", ["auto_0.5", 0.2])
+@pytest.mark.parametrize(
+    "compile", [False, pytest.param(True, marks=[pytest.mark.slow, COMPILER])], ids=["eager", "compiled"]
+)
+def test_agrees_with_stock_sac(ent_coef: str | float, compile: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    batches = make_batches()
+    level = make_level(batches, compile, ent_coef=ent_coef)
+    stock = make_stock(level, ent_coef=ent_coef)
+    train_stock(stock, batches, level_noise(level), monkeypatch)
+    level.train(UPDATES, BATCH)
+
+    assert level.compiled == compile
+    assert_same_policies(level, stock)
+    names = ["critic_loss", "actor_loss", "ent_coef"] + (["ent_coef_loss"] if ent_coef == "auto_0.5" else [])
+    for name in names:
+        theirs = stock.logger.name_to_value[f"train/{name}"]
+        assert level.logger.name_to_value[f"level/{name}"] == pytest.approx(theirs, abs=1e-5), name
+    if ent_coef == "auto_0.5":
+        assert level.log_ent_coef.item() == pytest.approx(stock.log_ent_coef.item(), abs=1e-6)
+
+
+def test_gradients_agree_with_stock_sac(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After one update Adam's first moment is 0.1 times the gradient."""
+    batches = make_batches(updates=1)
+    level = make_level(batches)
+    stock = make_stock(level)
+    train_stock(stock, batches, level_noise(level, 1), monkeypatch)
+    level.train(1, BATCH)
+    for module in ("actor", "critic"):
+        ours, theirs = getattr(level, module), getattr(stock, module)
+        vector = ours.optimizer.param_groups[0]["params"][0]
+        moment = ours.optimizer.state[vector]["exp_avg"]
+        for mine, their in zip(ours.parameters(), theirs.parameters(), strict=True):
+            start = (mine.data_ptr() - vector.data_ptr()) // 4
+            expected = theirs.optimizer.state[their]["exp_avg"].flatten()
+            assert th.allclose(moment[start : start + mine.numel()], expected, rtol=1e-4, atol=1e-7)
+
+
+def test_learning_rate_schedule_reaches_the_update(monkeypatch: pytest.MonkeyPatch) -> None:
+    batches = make_batches()
+
+    def schedule(progress: float) -> float:
+        return 2e-3 * progress
+
+    level = make_level(batches, learning_rate=schedule)
+    stock = make_stock(level, learning_rate=schedule)
+    noise = level_noise(level)
+    half = UPDATES // 2
+    for part, progress in ((slice(0, half), 0.9), (slice(half, UPDATES), 0.1)):
+        stock._current_progress_remaining = level._current_progress_remaining = progress
+        train_stock(stock, LevelBatch(*(x[part] for x in batches)), noise[part], monkeypatch)
+        level.train(half, BATCH)
+    assert_same_policies(level, stock)
+
+
+def test_negative_critics_bound_the_target() -> None:
+    level = make_level(make_batches(), policy_kwargs={"net_arch": [8], "negative_critic": True})
+    level.train(5, BATCH)
+    assert level.logger.name_to_value["level/q_mean"] < 0
+    q = level.critic(th.randn(64, OBS_DIM) * 10, th.zeros(64, ACTION_DIM))
+    assert len(q) == 2
+    assert all((x <= 0).all() for x in q)
+
+
+def test_squash_log_prob_is_the_density_of_the_action() -> None:
+    noise = th.randn(1000, 1, dtype=th.float64)
+    mean, log_std = th.full((1000, 1), 0.3, dtype=th.float64), th.full((1000, 1), -0.4, dtype=th.float64)
+    actions, log_prob = squash(mean, log_std, noise)
+    base = th.distributions.Normal(mean, log_std.exp())
+    exact = th.distributions.TransformedDistribution(base, th.distributions.TanhTransform())
+    inner = actions.abs() < 0.99
+    assert th.allclose(log_prob[inner], exact.log_prob(actions)[inner], atol=1e-4)
+
+
+@pytest.mark.parametrize("longest", [0.999, 0.3, 0.0])
+def test_average_actor_follows_the_actor(longest: float) -> None:
+    level = make_level(make_batches(), policy_kwargs={"net_arch": [8]}, average_decay=longest)
+    actors = [level._update.actor.vector.detach().clone()]
+    expected = actors[0].clone()
+    for n in range(1, 6):
+        level.train(1, BATCH)
+        decay = min(longest, (1 + n) / (10 + n))
+        expected = decay * expected + (1 - decay) * level._update.actor.vector.detach()
+    average = th.cat([b.flatten() for b in level._update.average.unflatten(level._update.average.vector)])
+    assert th.allclose(average, expected, atol=1e-6)
+    assert th.allclose(average, level._update.actor.vector) == (longest == 0.0)
+
+
+def test_modules_share_the_flat_storage() -> None:
+    level = make_level(make_batches())
+    update = level._update
+    assert all(flat.is_aliased() for flat in (update.actor, update.critic, update.target, update.average))
+    before = {k: v.clone() for k, v in level.policy.state_dict().items()}
+    level.train(2, BATCH)
+    assert all(not th.equal(before[k], v) for k, v in level.policy.state_dict().items())
+    level.policy.load_state_dict(before)
+    assert all(flat.is_aliased() for flat in (update.actor, update.critic, update.target, update.average))
+
+
+def test_flat_parameters_refuse_other_types() -> None:
+    level = make_level(make_batches())
+    with pytest.raises(ValueError, match="float32 on the CPU"):
+        FlatParameters(level.policy.actor.double().blocks())
+
+
+def test_auto_falls_back_with_one_log_line(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    monkeypatch.setattr(compilation, "compiler_problem", lambda: "no C++ compiler")
+    level = make_level(make_batches(), compile="auto")
+    with caplog.at_level(logging.WARNING):
+        level.train(2, BATCH)
+        level.train(2, BATCH)
+    assert not level.compiled
+    assert [r.message for r in caplog.records].count(caplog.records[0].message) == 1
+    assert "eagerly" in caplog.records[0].message
+    with pytest.raises(RuntimeError, match="no C\\+\\+ compiler"):
+        make_level(make_batches(), compile=True).train(1, BATCH)
+
+
+@pytest.mark.parametrize("field", ["rewards", "observations", "states"])
+def test_wrong_batches_are_refused(field: str) -> None:
+    batches = make_batches()
+    level = make_level(batches._replace(**{field: getattr(batches, field).double()}))
+    with pytest.raises(ValueError, match=f"batch.{field} must be float32"):
+        level.train(1, BATCH)
+
+
+def test_graph_passes_keep_the_numbers() -> None:
+    level = make_level(make_batches())
+    update = level._update
+    batch = level.replay_buffer.sample_burst(1, BATCH)
+    noise = level_noise(level, 1)
+    rows = update._schedules(1, 0.01, -2.0)
+    example = [th.zeros(6), level.log_ent_coef.data, *update._state(), *(x[0] for x in (rows, noise, *batch))]
+    graph = make_fx(update._step)(*(x.clone() for x in example))
+    n_nodes = len(graph.graph.nodes)
+    compilation.split_bias_from_products(graph)
+    compilation.merge_repeated(graph)
+    targets = [str(node.target) for node in graph.graph.nodes]
+    assert not any("addmm" in t or "baddbmm" in t for t in targets)
+    assert len(targets) != n_nodes
+    ours, theirs = ([x.clone() for x in example] for _ in range(2))
+    graph(*ours)
+    update._step(*theirs)
+    for a, b, before in zip(ours, theirs, example, strict=True):
+        assert th.allclose(a, b, atol=1e-6)
+        assert not th.equal(a, before) or a.numel() == 0 or any(a is x for x in ours[-10:])
+
+
+def test_broken_toolchain(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def fail(*args: object) -> None:
+        raise OSError("Python.h: no such file")
+
+    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    monkeypatch.setattr(compilation, "_compile", fail)
+    with caplog.at_level(logging.WARNING):
+        make_level(make_batches(), compile="auto").train(1, BATCH)
+    assert "OSError" in caplog.text
+    assert "Python.h" in caplog.text
+    with pytest.raises(OSError, match=r"Python\.h"):
+        make_level(make_batches(), compile=True).prepare(BATCH)
+
+
+def test_prepare_compiles_for_the_batch_size(monkeypatch: pytest.MonkeyPatch) -> None:
+    shapes = []
+    level = make_level(make_batches(), compile=True)
+    monkeypatch.setattr(compilation, "compiler_problem", lambda: None)
+    monkeypatch.setattr(
+        compilation, "_compile", lambda step, example: shapes.append([x.shape for x in example]) or (lambda *args: None)
+    )
+    before = level._update.actor.vector.detach().clone()
+    assert level.prepare(BATCH) >= 0.0
+    assert th.equal(before, level._update.actor.vector)
+    level.train(2, BATCH)
+    level.train(2, BATCH // 2)
+    assert len(shapes) == 2
+    assert shapes[0][-1] == (BATCH, 0)
+    assert level.compiled
+
+
+def test_unknown_compile_value() -> None:
+    with pytest.raises(ValueError, match="'auto', True or False"):
+        make_level(make_batches(), compile="maybe").train(1, BATCH)
+
+
+@pytest.mark.slow
+@COMPILER
+def test_compiled_circuit_agrees_with_eager() -> None:
+    circuit = {"inter": 5, "command": 4, "motor": 2, "sensory_fanout": 3, "inter_fanout": 3,
+               "recurrent_command_synapses": 3, "motor_fanin": 3}  # fmt: skip
+    levels = []
+    for compile in (False, True):
+        kwargs = {"policy_kwargs": {"net_arch": [8], "ndbc": circuit, "mean_bound": 3.0, "negative_critic": True}}
+        level = make_level(make_batches(state_dim=11), compile, **kwargs)
+        level.train(UPDATES, BATCH)
+        levels.append(level)
+    eager, compiled = (level.policy.state_dict() for level in levels)
+    assert levels[1].compiled
+    assert len(levels[1]._update._steps) == 1
+    for name, value in eager.items():
+        assert th.allclose(compiled[name], value, rtol=0, atol=1e-5), name
+
+
+class LabelledBuffer(FixedBuffer):
+    """The same batches with a label each."""
+
+    def __init__(self, batches: LevelBatch, label: float) -> None:
+        super().__init__(batches)
+        self.label = label
+
+    def sample_labelled(self, gradient_steps: int, batch_size: int) -> tuple[LevelBatch, th.Tensor]:
+        return self.sample_burst(gradient_steps, batch_size), th.full((gradient_steps, batch_size, 1), self.label)
+
+
+def labelled_level(label: float, coef: float, compile: bool = False) -> SACLevel:
+    level = make_level(make_batches(), compile, label_coef=coef, ent_coef=0.01)
+    level.attach(LabelledBuffer(make_batches(), label))
+    return level
+
+
+def test_label_loss_is_added_to_the_actors_loss() -> None:
+    """One update: with Adam's first moment 0.1 times the gradient, its difference is the label loss's gradient."""
+    moments, levels = [], []
+    for coef in (1e-9, 2.0):
+        level = labelled_level(0.4, coef)
+        start = level._update.actor.vector.detach().clone().requires_grad_()
+        level.train(1, BATCH)
+        moments.append(level.actor.optimizer.state[level._update.actor.vector]["exp_avg"] / 0.1)
+        levels.append(level)
+    batch, noise = make_batches(), level_noise(levels[0], 1)
+    mean, log_std, _ = level.policy.actor.step_blocks(
+        level._update.actor.unflatten(start), [], batch.observations[0], batch.states[0]
+    )
+    actions, _ = squash(mean, log_std, noise[0, 0])
+    (expected,) = th.autograd.grad(2.0 * (actions[:, -1] - 0.4).square().mean(), start)
+    assert th.allclose(moments[1] - moments[0], expected, atol=1e-5)
+    losses = [level.logger.name_to_value["level/actor_loss"] for level in levels]
+    added = 2.0 * float((actions[:, -1] - 0.4).square().mean().detach())
+    assert losses[1] - losses[0] == pytest.approx(added, abs=1e-4)
+
+
+def test_labels_where_they_are_needed_and_only_there() -> None:
+    level = labelled_level(0.4, 1.0)
+    batch, noise = level.replay_buffer.sample_burst(1, BATCH), level_noise(level, 1)
+    arguments = {"tau": 0.01, "target_entropy": -2.0, "ent_coef": level._ent_coef_state()}
+    with pytest.raises(ValueError, match="labels are needed where label_coef is not 0"):
+        level._update.run(batch, noise, **arguments)
+    with pytest.raises(ValueError, match=r"batch\.labels must be float32 of shape"):
+        level._update.run(batch, noise, labels=th.zeros(1, BATCH, 2), **arguments)
+
+
+@pytest.mark.slow
+@COMPILER
+def test_compiled_label_loss_agrees_with_eager() -> None:
+    eager, compiled = (labelled_level(-0.3, 1.5, compile) for compile in (False, True))
+    for level in (eager, compiled):
+        level.train(UPDATES, BATCH)
+    assert compiled.compiled
+    for name, value in eager.policy.state_dict().items():
+        assert th.allclose(compiled.policy.state_dict()[name], value, rtol=0, atol=1e-5), name

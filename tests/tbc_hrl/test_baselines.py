@@ -1,0 +1,113 @@
+"""HAC and flat SAC: what makes them what they are, and that they go through the same doors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from corridor import Corridor
+
+from sb3_tbc import HAC, TBCHRL
+from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+from sb3_tbc.zoo.algorithms import algorithm_of, read_zip
+
+LEVEL: dict[str, Any] = {"batch_size": 16, "policy_kwargs": {"net_arch": [8, 8]}}
+
+
+def make_hac(**kwargs: Any) -> HAC:
+    settings = {"high": LEVEL, "low": LEVEL, "max_options": 5, "gradient_ratio": 0.1, "compile": False, "seed": 0}
+    return HAC("MultiInputPolicy", Corridor(), **{**settings, **kwargs})
+
+
+def make_flat(**kwargs: Any) -> FlatSAC:
+    settings = {"gradient_ratio": 0.05, "batch_size": 16, "buffer_size": 500, "learning_starts": 50, "seed": 0}
+    return FlatSAC("MultiInputPolicy", Corridor(), **{**settings, "policy_kwargs": {"net_arch": [8]}, **kwargs})
+
+
+def test_hac_has_no_time() -> None:
+    model = make_hac()
+    assert isinstance(model, TBCHRL)
+    assert model.high.action_space.shape == (1,)  # a subgoal, no time budget
+    assert model.low.observation_space.shape == (4,)  # local state and subgoal, no remaining time
+    assert model.low.state_dim == 0
+    for level in (model.high, model.low):  # all rewards are -1 or 0
+        assert level.policy.critic.negative
+    gamma = model.high_settings["gamma"]  # per decision, however long it took
+    assert model.high_reward.discounts(np.array([1, 7])).tolist() == [gamma, gamma]
+    assert model.high_reward.duration_cost == 0
+
+
+def test_hac_low_level_acts_until_its_subgoal_or_its_own_budget() -> None:
+    model = make_hac(dt_max=6.5, gradient_ratio=0.0, max_options=20).learn(250)
+    data, n = model.replay_buffer.low.data, model.replay_buffer.low.size()
+    rows = {name: array[:n] for name, array in data.items()}
+    assert rows["length"].max() == 7  # 6.5 actions are seven
+    reached = np.abs(rows["achieved"] - rows["subgoal"]) < 0.05
+    np.testing.assert_array_equal(rows["rewards"], reached - 1.0)
+    np.testing.assert_array_equal(rows["dones"], reached)  # a used-up budget bootstraps
+    last = rows["position"] == rows["length"] - 1
+    assert (last | ~reached).all()  # a window ends where its subgoal is reached
+
+
+def test_hac_learns_saves_and_loads(tmp_path: Path) -> None:
+    model = make_hac().learn(150)
+    assert min(model.high._n_updates, model.low._n_updates) > 0
+    model.save(tmp_path / "model.zip")
+    assert algorithm_of(tmp_path / "model.zip", read_zip(tmp_path / "model.zip")) == "hac"
+    loaded = HAC.load(tmp_path / "model.zip", env=Corridor())
+    ours, theirs = (evaluate_agent(m, Corridor(), 3, seed=1) for m in (model, loaded))
+    np.testing.assert_array_equal(ours.lengths, theirs.lengths)
+
+
+def test_hac_levels_may_take_hindsight_goals_from_different_places() -> None:
+    model = make_hac(low={**LEVEL, "goal_strategy": "episode", "n_hindsight_goals": 4})
+    assert model.replay_buffer.low.hindsight == "episode"
+    assert model.replay_buffer.low.n_hindsight_goals == 4
+    assert model.store.hindsight.goal_strategy == "future"
+
+
+def test_flat_sac_learns_and_is_evaluated() -> None:
+    model = make_flat().learn(300)
+    assert model._n_updates == 3 * 5  # a burst every hundred steps
+    result = evaluate_agent(model, Corridor(), 3, seed=1)
+    assert result.lengths.max() <= 50
+    assert np.isnan(result.subgoal_success).all()
+    assert not result.budget_exhausted.any()
+    np.testing.assert_array_equal(result.lengths, evaluate_agent(model, Corridor(), 3, seed=1).lengths)
+
+
+def test_relabelled_transitions_that_meet_their_goal_are_terminal() -> None:
+    model = make_flat(gradient_ratio=0.01, n_hindsight_goals=1000).learn(200)
+    samples = model.replay_buffer.sample(200)
+    reached = (samples.next_observations["achieved_goal"] - samples.observations["desired_goal"]).abs() <= 0.05
+    assert 0 < reached.float().mean() < 1
+    assert th.equal(samples.dones.bool(), reached)
+    assert th.equal(samples.rewards, reached.float() - 1)
+
+
+def test_flat_replay_resumes_from_plain_arrays(tmp_path: Path) -> None:
+    model = make_flat().learn(300)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "replay.pkl")
+    loaded = FlatSAC.load(tmp_path / "model.zip", env=Corridor())
+    loaded.load_replay_buffer(tmp_path / "replay.pkl")
+    ours, theirs = model.replay_buffer, loaded.replay_buffer
+    assert theirs.pos == ours.pos == 300
+    assert ours.ep_length[:300].min() == 0
+    for key in ours.observations:
+        np.testing.assert_array_equal(theirs.observations[key], ours.observations[key])
+    assert theirs.ep_length[:300].min() > 0  # the unfinished episode was closed
+    loaded.learn(100, reset_num_timesteps=False)
+    assert loaded.num_timesteps == 400
+    small = make_flat(buffer_size=100)
+    with pytest.raises(ValueError, match="does not fit"):
+        small.load_replay_buffer(tmp_path / "replay.pkl")
+
+
+def test_flat_mistakes() -> None:
+    with pytest.raises(ValueError, match="gradient_ratio must not be negative"):
+        make_flat(gradient_ratio=-1)

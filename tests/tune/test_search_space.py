@@ -1,0 +1,191 @@
+"""Search spaces: the tables' rows lie inside, what a trial suggests becomes a configuration, mistakes are told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.tune.search_space import Parameter, apply, build_space, complete, load_space, project, restrict, suggest
+from sb3_tbc.zoo.config import config_file, load_config, parse_overrides, read_file
+
+ALGOS = ("tbc-hrl", "hits", "hac", "sac")
+TASKS = sorted(set(read_file(config_file("tbc-hrl"))) - {"default"})
+TABLE_A1 = {"inter", "command", "motor", "sensory_fanout", "inter_fanout", "recurrent_command_synapses", "motor_fanin"}
+
+
+class Drawn:
+    """A trial whose choices hypothesis makes."""
+
+    def __init__(self, draw: Any) -> None:
+        self.draw = draw
+
+    def suggest_float(self, name: str, low: float, high: float, *, step: float | None, log: bool) -> float:
+        return float(self.draw(st.floats(low, high)))
+
+    def suggest_int(self, name: str, low: int, high: int, *, step: int, log: bool) -> int:
+        return int(self.draw(st.integers(low, high)))
+
+    def suggest_categorical(self, name: str, choices: Any) -> Any:
+        return self.draw(st.sampled_from(choices))
+
+
+def active(space: tuple[Parameter, ...], values: dict[str, Any]) -> set[str]:
+    """Parameters whose condition holds."""
+    return {p.name for p in space if not p.when or values.get(p.when[0]) == p.when[1]}
+
+
+@pytest.mark.parametrize("config", ["paper", "tuned"])
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algo", ALGOS)
+def test_every_shipped_row_lies_in_the_space(algo: str, task: str, config: str) -> None:
+    run = complete(load_config(algo, task, config), 1)
+    space = build_space(restrict(load_space(algo, task), run, (), {}))
+    values = project(space, run)
+    assert set(values) == active(space, values)
+    again = apply(space, values, run)
+    assert project(space, again) == values
+    for level in ("low", "high") if algo != "sac" else ("",):
+        had, has = (r.model[level] if level else r.model for r in (run, again))
+        for key in ("batch_size", "tau"):
+            assert has[key] == had[key]
+        if not str(had["ent_coef"]).startswith("auto"):
+            assert has["ent_coef"] == had["ent_coef"]
+    assert again.model.get("max_options") == run.model.get("max_options")
+
+
+def test_the_columns_of_tables_a1_and_a2_are_searched() -> None:
+    space = {p.name: p for p in build_space(load_space("tbc-hrl", "Pendulum"))}
+    assert {f"ndbc.{column}" for column in TABLE_A1} | {"ndbc.sub_steps", "memory"} <= set(space)
+    assert {"max_options", "n_hindsight_goals", "batch_size", "tau", "kappa"} <= set(space)
+    for level in ("low", "high"):
+        assert {f"{level}.{k}" for k in ("learning_rate", "temperature", "ent_coef", "target_entropy")} <= set(space)
+        assert space[f"{level}.learning_rate"].log
+        assert space[f"{level}.ent_coef"].log
+    assert space["tau"].log
+    hits = {p.name for p in build_space(load_space("hits", "Pendulum"))}
+    assert "memory" not in hits
+    assert not any(name.startswith("ndbc") for name in hits)
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.data())
+def test_what_a_trial_suggests_can_be_read_back(data: Any) -> None:
+    run = complete(load_config("tbc-hrl", "Pendulum"), 1)
+    space = build_space(restrict(load_space("tbc-hrl", "Pendulum"), run, (), {}))
+    values = suggest(space, Drawn(data.draw))
+    assert set(values) == active(space, values)
+    assert project(space, apply(space, values, run)) == values
+
+
+def test_a_value_reaches_all_its_keys() -> None:
+    run = load_config("tbc-hrl", "Pendulum", "paper")
+    space = build_space(load_space("tbc-hrl", "Pendulum"))
+    changed = apply(space, {"tau": 0.2, "ndbc.inter": 9, "memory": "episode", "low.temperature": "auto"}, run).model
+    assert changed["low"]["tau"] == changed["high"]["tau"] == 0.2
+    assert changed["low"]["policy_kwargs"]["ndbc"]["inter"] == 9
+    assert changed["low"]["policy_kwargs"]["ndbc"]["command"] == 6
+    assert changed["memory"] == "episode"
+    assert changed["low"]["ent_coef"] == "auto"
+    assert run.model["low"]["tau"] == 0.0139
+
+
+def test_a_schedule_is_written_as_text() -> None:
+    run = load_config("tbc-hrl", "UR5Reacher", "paper")
+    space = build_space(load_space("tbc-hrl", "UR5Reacher"))
+    falling = apply(space, {"learning_rate_schedule": "linear", "low.learning_rate": 1e-3}, run)
+    assert falling.model["low"]["learning_rate"] == "lin_0.001"
+    assert falling.model["high"]["learning_rate"] == "lin_0.0005216"  # not searched here, but scheduled too
+    assert project(space, falling)["learning_rate_schedule"] == "linear"
+    constant = apply(space, {"learning_rate_schedule": "constant"}, falling)
+    assert constant.model["high"]["learning_rate"] == 5.216e-4
+
+
+def test_a_value_outside_of_a_range_is_left_out() -> None:
+    run = load_config("tbc-hrl", "Drawbridge", "paper")
+    space = build_space(
+        {"tau": {"low": 0.01, "high": 0.1, "keys": ["low.tau", "high.tau"]}, "max_options": {"low": 2, "high": 9}}
+    )
+    assert project(space, run) == {"max_options": 5}
+
+
+def test_the_users_file_changes_ranges(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yml"
+    path.write_text("default: {tau: {high: 2e-1}, memory: null}\nPendulum: {batch_size: {low: 64, high: 128}}\n")
+    space = {p.name: p for p in build_space(load_space("tbc-hrl", "Pendulum", path))}
+    assert (space["tau"].low, space["tau"].high, space["tau"].log) == (5e-5, 0.2, True)
+    assert "memory" not in space
+    assert space["batch_size"].choices == ()
+    assert space["batch_size"].whole
+    assert space["batch_size"].keys == ("low.batch_size", "high.batch_size")
+    assert {p.name: p for p in build_space(load_space("tbc-hrl", "Tennis2D", path))}["batch_size"].choices
+
+
+def test_what_the_command_line_fixes_is_not_searched() -> None:
+    run, declared = load_config("tbc-hrl", "Pendulum"), load_space("tbc-hrl", "Pendulum")
+    left = restrict(declared, run, (), parse_overrides(["low.tau:0.1", "memory:none", "low.ent_coef:0.3"]))
+    assert left["tau"]["keys"] == ["high.tau"]
+    assert not {"memory", "low.ent_coef", "low.temperature"} & set(left)
+    few = restrict(declared, run, ["*learning_rate", "low.target_entropy", "low.ent_coef"], {})
+    assert set(few) == {"low.learning_rate", "high.learning_rate", "low.target_entropy"}  # Pendulum's low level is auto
+    assert "when" not in few["low.target_entropy"]
+    with pytest.raises(
+        ConfigError, match=r"'low\.lerning_rate' matches no parameter; did you mean 'low\.learning_rate'"
+    ):
+        restrict(declared, run, ["low.lerning_rate"], {})
+    with pytest.raises(ConfigError, match="nothing is left"):
+        restrict(declared, run, ["memory"], {"memory": "none"})
+
+
+def test_no_circuit_no_circuit_parameters() -> None:
+    run = load_config("tbc-hrl", "Pendulum", overrides={"low": {"policy_kwargs": {"ndbc": None}}})
+    assert not any(name.startswith("ndbc") for name in restrict(load_space("tbc-hrl", "Pendulum"), run, (), {}))
+
+
+def test_kappa_is_searched_where_it_acts() -> None:
+    declared = load_space("tbc-hrl", "Pendulum")
+    for change, acts in (
+        ({"duration": "rule"}, True),
+        ({"duration_loss_coef": 0.1}, True),
+        ({"duration": "joint"}, False),
+    ):
+        base = {"duration": "joint", "duration_loss_coef": 0.0, **change}
+        run = load_config("tbc-hrl", "Pendulum", overrides=base)
+        assert ("kappa" in restrict(declared, run, (), {})) == acts
+
+
+def test_an_unknown_task_gets_the_agents_own_circuit() -> None:
+    circuit = complete(load_config("tbc-hrl", "Other-v0"), 3).model["low"]["policy_kwargs"]["ndbc"]
+    assert circuit["motor"] == 3
+    assert set(circuit) == TABLE_A1 | {"sub_steps"}
+    assert (
+        project(build_space(load_space("tbc-hrl", "Other-v0")), load_config("tbc-hrl", "Other-v0"))["max_options"] == 20
+    )
+    hits = load_config("hits", "Other-v0")
+    assert complete(hits, 3) == hits
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("default: {tau: {lo: 1}}", r"tau: unknown field 'lo'; did you mean 'low'"),
+        ("default: {x: {low: 2, high: 1}}", r"x needs low and high with low <= high"),
+        ("default: {x: {low: 0, high: 1, log: true}}", r"must begin above 0"),
+        ("default: {low.lerning_rate: {low: 1, high: 2}}", r"unknown key 'lerning_rate'; did you mean 'learning_rate'"),
+        ("default: {memory: {choices: [window, both]}}", r"memory must be one of"),
+        ("default: {low.ent_coef: {when: {low.temp: fixed}}}", r"'when' must name a parameter above it"),
+        ("default: {learning_rate_schedule: {choices: [cosine]}}", r"must be among constant, linear"),
+        ("default: {tau: 3}", r"tau must have fields"),
+        ("default: 3", r"expected sections"),
+        ("default: {a: [}", r"cannot read search space"),
+    ],
+)
+def test_mistakes_in_a_file(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "mine.yml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_space("tbc-hrl", "Pendulum", path)

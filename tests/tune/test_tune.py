@@ -1,0 +1,411 @@
+"""The search command on a corridor that trains in a second: first trials, resuming, retrying, best trial, mistakes."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import optuna
+import pytest
+import yaml
+from optuna.trial import TrialState
+
+from sb3_tbc import train
+from sb3_tbc.tune import command as tune
+from sb3_tbc.tune import study as studies
+from sb3_tbc.tune import trial as trials
+from sb3_tbc.tune import worker
+from sb3_tbc.tune.results import difference, find_trial, importances, write_plots
+from sb3_tbc.tune.study import ORIGIN, REASON, open_storage, read_settings
+from sb3_tbc.zoo.callbacks import SuccessEvalCallback, read_evaluations
+from sb3_tbc.zoo.config import load_config
+
+ENV = "tuned_corridor:TunedCorridor-v0"
+TINY = [
+    "--hyperparams",
+    "compile:false",
+    "gradient_ratio:0.05",
+    "low.batch_size:16",
+    "low.buffer_size:2000",
+    "high.buffer_size:500",
+]
+SHORT = ["--n-timesteps", "200", "--eval-freq", "100", "--n-eval-episodes", "2", "--n-final-episodes", "2"]
+NAME = "tbc-hrl-TunedCorridor-v0"
+
+
+def arguments(folder: Path, *more: str) -> list[str]:
+    return ["--env", ENV, "--log-folder", str(folder), *more]
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """Standard error, which must be one line without a traceback."""
+    captured = capsys.readouterr()
+    assert captured.err.count("\n") == 1, captured.err
+    assert "Traceback" not in captured.err
+    return captured.err
+
+
+def load(folder: Path, grace: int = 60) -> optuna.Study:
+    return optuna.load_study(study_name=NAME, storage=open_storage(str(folder / NAME / "journal.log"), grace))
+
+
+@pytest.fixture(scope="module")
+def searched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished search of three trials."""
+    folder = tmp_path_factory.mktemp("tune")
+    assert tune.main(arguments(folder, "--n-trials", "3", *SHORT, *TINY)) == 0
+    return folder
+
+
+def test_first_trial_is_the_configuration_without_search(searched: Path) -> None:
+    study = load(searched)
+    assert [t.state for t in study.trials] == [TrialState.COMPLETE] * 3
+    assert [t.user_attrs.get(ORIGIN) for t in study.trials] == ["default", None, None]
+    settings = read_settings(study)
+    assert settings.config_of(study.trials[0]).model == settings.run.model
+    assert study.trials[0].params["max_options"] == 20
+    for t in study.trials:
+        assert set(t.user_attrs["seed_values"]) == {"0", "1"}
+        assert t.value == pytest.approx(np.mean(list(t.user_attrs["seed_values"].values())))
+        assert sorted(t.intermediate_values) == [1, 2, 4, 5]  # two evaluations for each of two seeds
+
+
+def test_the_paper_and_the_tuned_row_come_first(tmp_path: Path) -> None:
+    args = tune.build_parser().parse_args(["--env", "Drawbridge", "--log-folder", str(tmp_path)])
+    settings = tune.new_settings(args)
+    assert list(settings.first_trials()) == ["paper", "tuned"]
+    for name in ("paper", "tuned"):
+        run, shipped = settings.baselines[name], load_config("tbc-hrl", "Drawbridge", name).to_dict()
+        assert run["env_kwargs"] == shipped["env_kwargs"]
+        assert difference(shipped["model"], run["model"]) == {"low": {"policy_kwargs": {"ndbc": {"sub_steps": 3}}}}
+    assert settings.base == settings.baselines["tuned"]
+    assert settings.first_trials()["paper"]["tau"] == 0.34603
+    assert settings.first_trials()["tuned"]["learning_rate_schedule"] == "linear"
+
+
+@pytest.mark.parametrize("config", [None, "paper"])
+def test_an_unknown_task_begins_with_what_train_would_run(tmp_path: Path, config: str | None) -> None:
+    given = ["--config", config] if config else []
+    settings = tune.new_settings(tune.build_parser().parse_args(arguments(tmp_path, *given)))
+    plain = load_config("tbc-hrl", "TunedCorridor-v0", config).model
+    assert {key: settings.run.model[key] for key in plain if key != "low"} == {
+        key: value for key, value in plain.items() if key != "low"
+    }
+    assert settings.run.model["memory"] == ("window" if config else "none")
+    assert list(settings.first_trials()) == ["default"]
+
+
+def test_what_is_left_behind(searched: Path) -> None:
+    folder = searched / NAME
+    with (folder / "trials.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(r["number"], r["state"], r["origin"]) for r in rows[:2]] == [
+        ("0", "COMPLETE", "default"),
+        ("1", "COMPLETE", ""),
+    ]
+    assert (folder / "history.png").read_bytes().startswith(b"\x89PNG")
+    assert (folder / "trial_0002" / "seed_1" / "model.zip").is_file()  # the policies of trials are kept
+    assert not list(folder.rglob("checkpoint*"))
+
+
+def test_the_best_trial_trains_again_to_the_same_curve(searched: Path, tmp_path: Path) -> None:
+    study = load(searched)
+    best = study.best_trial
+    path = searched / NAME / "best.yml"
+    section = yaml.safe_load(path.read_text())["TunedCorridor-v0"]
+    assert section["n_timesteps"] == 200
+    config = ["--config", str(path), "--eval-freq", "100", "--n-eval-episodes", "2", "--n-final-episodes", "2"]
+    where = ["--log-folder", str(tmp_path), "--variant", "best", "--no-progress"]
+    assert train.main(["--env", ENV, *config, "--seed", "1", *where]) == 0
+    again = read_evaluations(tmp_path / "TunedCorridor-v0" / "tbc-hrl" / "best" / "seed_1" / "evaluations.csv")
+    first = read_evaluations(searched / NAME / f"trial_{best.number:04d}" / "seed_1" / "evaluations.csv")
+    assert [row._replace(wall_time=0) for row in again] == [row._replace(wall_time=0) for row in first]
+    assert again
+
+
+@pytest.mark.parametrize("which", ["0", "1", "best"])
+def test_train_from_a_trial(searched: Path, which: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert tune.main(arguments(searched, "--trial", which, "--n-timesteps", "100", "--overwrite")) == 0
+    capsys.readouterr()
+    study = load(searched)
+    number = find_trial(study, which).number
+    runs = list((searched / NAME / "train").glob(f"*/tbc-hrl/trial_{number:04d}/seed_0/config.yml"))
+    assert len(runs) == 1
+    model = yaml.safe_load(runs[0].read_text())["model"]
+    assert model == read_settings(study).config_of(study.trials[number]).model
+
+
+def test_resuming_needs_no_options_and_counts_what_is_done(searched: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert tune.main(arguments(searched, "--n-trials", "3")) == 0
+    assert "(3 of 3 trials done)" in capsys.readouterr().out
+    assert len(load(searched).trials) == 3
+    assert tune.main(arguments(searched, "--n-trials", "4", "--sampler", "random", "--pruner", "none")) == 0
+    assert "worker 0: trial 3, seed 0: " in capsys.readouterr().out
+    study = load(searched)
+    assert len(study.trials) == 4
+    assert len(study.trials[3].user_attrs["seed_values"]) == 2
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--algo", "hits", "--study-name", NAME], "is of another algorithm: --algo is tbc-hrl there, not hits"),
+        (["--env", "Pendulum", "--study-name", NAME], "--env is TunedCorridor-v0 there, not Pendulum"),
+        (["--objective", "final"], "begun with other options: --objective is auc there, not final"),
+        (["--n-seeds", "3"], "--n-seeds is 2 there, not 3"),
+        (["--hyperparams", "low.tau:0.1"], "--hyperparams is ['compile:false'"),
+        (["--trial", "99"], "a trial's number (0 to"),
+        (["--trial", "last"], "--trial must be 'best' or a trial's number"),
+        (["--trial", "best", "--study-name", "other"], "no study 'other'"),
+        (["--sampler", "tpee"], "unknown sampler 'tpee'; did you mean 'tpe'?"),
+        (["--pruner", "medain"], "unknown pruner 'medain'; did you mean 'median'?"),
+        (["--algo", "hit"], "unknown algorithm 'hit'"),
+        (["--env", "Pendulm"], "unknown environment 'Pendulm'"),
+    ],
+)
+def test_mistakes_on_an_existing_study(
+    searched: Path, more: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (searched / NAME / "journal.log").read_bytes()
+    assert tune.main(arguments(searched, *more)) == 2
+    assert message in said(capsys)
+    assert (searched / NAME / "journal.log").read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--storage", "nowhere/study.txt"], "storage must be a journal file ending in .log or .journal, or a URL"),
+        (["--storage", "postgres//me:secret@host/db"], "storage must be a journal file"),
+        (["--storage", "nosuchdb://me:secret@host/db"], "cannot open storage nosuchdb://me:***@host/db"),
+        (["--storage", "nosuchdb://host/db?password=secret&x=1"], "nosuchdb://host/db?password=***&x=1"),
+        (["--n-timesteps", "200", "--eval-freq", "300"], "--eval-freq must be at most the 200 steps of a run"),
+        (["--minutes", "0"], "--minutes must be above 0, got 0"),
+        (["--minutes", "nan"], "--minutes must be above 0, got nan"),
+        (["--storage", "sqlite:////no/such/folder/study.db"], "cannot open storage sqlite:////no/such/folder/study.db"),
+        (["--storage", "/proc/study.log"], "cannot open storage /proc/study.log"),
+        (["--hyperparams", "random_fraction:2"], "random_fraction must lie in [0, 1]"),
+        (["--search", "low.gama"], "matches no parameter"),
+        (["--search-space", "nowhere.yml"], "cannot read search space nowhere.yml"),
+        (["--threshold", "0"], "--threshold is a success rate"),
+        (["--trial", "best"], "no study"),
+    ],
+)
+def test_mistakes_on_a_new_study(
+    tmp_path: Path, more: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert tune.main(arguments(tmp_path, *more)) == 2
+    error = said(capsys)
+    assert message in error
+    assert "secret" not in error
+    assert not list(tmp_path.rglob("journal.log*"))
+
+
+# --------------------------------------------------------------------------------------------- what goes wrong
+
+
+def quick(monkeypatch: pytest.MonkeyPatch, outcome: Any) -> list[int]:
+    """Replace training by ``outcome(spec, folder, after_eval)``; returns the seeds trained, in order."""
+    seeds: list[int] = []
+
+    def start(spec: Any, folder: Any, command: str, options: Any, overwrite: bool, after_eval: Any) -> Any:
+        seeds.append(spec.seed)
+        return outcome(spec, folder, after_eval) or {"success_rate": 0.5}
+
+    monkeypatch.setattr(trials, "start_run", start)
+    return seeds
+
+
+def test_a_run_that_is_not_finite_is_pruned_with_its_reason(tmp_path: Path) -> None:
+    space = tmp_path / "space.yml"
+    space.write_text("default: {low.learning_rate: {low: 1.0e+37, high: 2.0e+37}}\n")
+    more = ["--n-trials", "2", "--search", "low.learning_rate", "--search-space", str(space)]
+    assert tune.main(arguments(tmp_path, *more, *SHORT, *TINY)) == 0
+    study = load(tmp_path)
+    assert [t.state for t in study.trials] == [TrialState.COMPLETE, TrialState.PRUNED]
+    assert study.trials[1].user_attrs[REASON].startswith("not finite: low.")
+    assert "not finite: low." in (tmp_path / NAME / "trials.csv").read_text()
+    assert study.best_trial.number == 0
+
+
+def test_a_diverging_run_is_pruned_with_its_reason() -> None:
+    watch = trials.LossWatch()
+    watch.write({"low/critic_loss": 3.0, "low/q_mean": 1e9}, {}, 100)
+    assert watch.reason == ""
+    watch.write({"low/critic_loss": 2e6, "high/critic_loss": float("nan")}, {}, 1200)
+    assert watch.reason == "diverging: low/critic_loss is 2e+06 at step 1,200"
+    callback = trials.ReportCallback(lambda rows: None)
+    callback.watch = watch
+    callback.parent = object.__new__(SuccessEvalCallback)
+    with pytest.raises(optuna.TrialPruned, match="diverging: low/critic_loss"):
+        callback._on_step()
+
+
+def test_a_stopped_trial_goes_back_into_the_queue(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop_in_the_second_seed(spec: Any, folder: Any, after_eval: Any) -> None:
+        if spec.seed == 1 and not stopped:
+            stopped.append(True)
+            raise trials.Interrupted("stopped at 100 of 200 steps", folder.path)
+
+    stopped: list[bool] = []
+    seeds = quick(monkeypatch, stop_in_the_second_seed)
+    assert tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY)) == 130
+    assert "the same command goes on" in capsys.readouterr().err
+    states = [t.state for t in load(tmp_path).trials]
+    assert states == [TrialState.FAIL, TrialState.WAITING]
+    assert tune.main(arguments(tmp_path, "--n-trials", "2")) == 0
+    study = load(tmp_path)
+    assert [t.state for t in study.trials] == [TrialState.FAIL, TrialState.COMPLETE, TrialState.COMPLETE]
+    assert study.trials[1].user_attrs[ORIGIN] == "default"
+    assert study.trials[1].params == study.trials[0].params
+    assert seeds == [0, 1, 1, 0, 1]  # the finished seed of the stopped trial is not trained twice
+
+
+def test_a_dead_workers_trial_is_run_again_and_counted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick(monkeypatch, lambda spec, folder, after_eval: None)
+    assert tune.main(arguments(tmp_path, "--n-trials", "1", *SHORT, *TINY)) == 0
+    study = load(tmp_path)
+    dead = study.ask()  # a worker takes a trial, shows a sign of life, and is killed
+    dead.suggest_float("tau", 5e-5, 0.5, log=True)
+    study._storage.record_heartbeat(dead._trial_id)  # type: ignore[attr-defined]
+    sign = tmp_path / NAME / "journal.log.alive" / f"trial_{dead._trial_id}"
+    studies.retire_stale(study)
+    assert study.trials[1].state == TrialState.RUNNING  # it still lives, as far as one can see
+    os.utime(sign, (1, 1))
+    assert tune.main(arguments(tmp_path, "--n-trials", "3")) == 0
+    study = load(tmp_path)
+    assert [t.state for t in study.trials] == [TrialState.COMPLETE, TrialState.FAIL] + 2 * [TrialState.COMPLETE]
+    assert study.trials[2].params["tau"] == study.trials[1].params["tau"]
+    assert study.trials[2].system_attrs["retry_history"] == [1]
+    assert studies.count_done(study) == 3
+
+
+def test_a_worker_thought_dead_does_not_count_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def declared_dead(spec: Any, folder: Any, after_eval: Any) -> None:
+        study = load(tmp_path)
+        if len(study.trials) == 1:
+            (tmp_path / NAME / "journal.log.alive").joinpath(f"trial_{study.trials[0]._trial_id}").unlink()
+            study._storage._grace = -1  # type: ignore[attr-defined]
+            studies.retire_stale(study)
+
+    quick(monkeypatch, declared_dead)
+    assert tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY)) == 0
+    assert "trial 0 was given to another worker" in capsys.readouterr().out
+    states = [t.state for t in load(tmp_path).trials]
+    assert states == [TrialState.FAIL, TrialState.COMPLETE, TrialState.COMPLETE]
+
+
+def test_a_trial_too_many_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    quick(monkeypatch, lambda spec, folder, after_eval: None)
+    assert tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY)) == 0
+    job = worker.Job(str(tmp_path / NAME / "journal.log"), NAME, tmp_path, 2, "random", "none", 0, "cpu", 60)
+    study, runner = worker.load(job, 0)
+    worker._one_trial(study, runner, 0)  # as if another had taken the last one in the same moment
+    assert [t.state for t in study.trials] == [TrialState.COMPLETE, TrialState.COMPLETE, TrialState.FAIL]
+    assert studies.count_done(study) == 2
+
+
+def test_a_baseline_queued_twice_runs_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    seeds = quick(monkeypatch, lambda spec, folder, after_eval: None)
+
+    def queue_twice(job: worker.Job, n: int) -> int:
+        study = load(tmp_path)
+        (values,) = (t.system_attrs["fixed_params"] for t in study.trials)
+        study.enqueue_trial(values, user_attrs={ORIGIN: "default"})  # as if two machines had begun the study at once
+        return run_workers(job, n)
+
+    run_workers = worker.run_workers
+    monkeypatch.setattr(worker, "run_workers", queue_twice)
+    assert tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY)) == 0
+    study = load(tmp_path)
+    assert [t.state for t in study.trials] == [TrialState.COMPLETE, TrialState.FAIL, TrialState.COMPLETE]
+    assert [t.user_attrs.get(ORIGIN) for t in study.trials] == ["default", "default", None]
+    assert seeds == [0, 1, 0, 1]
+
+
+def test_a_study_that_another_machine_is_just_creating_is_joined(tmp_path: Path) -> None:
+    args = tune.build_parser().parse_args(arguments(tmp_path, *SHORT, *TINY))
+    wanted, storage = tune.new_settings(args), open_storage(str(tmp_path / "study.log"))
+    other = optuna.create_study(storage=storage, study_name="shared", direction="maximize")
+    later = threading.Timer(0.5, other.set_user_attr, ("settings", asdict(wanted)))
+    later.start()
+    _, settings = studies.open_study(storage, "shared", "study.log", wanted, {})
+    later.join()
+    assert settings.run == wanted.run
+    optuna.create_study(storage=storage, study_name="foreign", direction="maximize").ask()
+    with pytest.raises(studies.ConfigError, match="was not made by this command"):
+        studies.open_study(storage, "foreign", "study.log", wanted, {})
+
+
+def test_ctrl_c_in_a_background_script_is_not_for_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    handlers: list[Any] = []
+    monkeypatch.setattr(worker, "work", lambda job, index: handlers.append(signal.getsignal(signal.SIGINT)))
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    job = worker.Job("study.log", NAME, Path(), 1, "random", "none", 0, "cpu", 60)
+    try:
+        for inherited in (signal.SIG_IGN, signal.default_int_handler):
+            signal.signal(signal.SIGINT, inherited)
+            worker._main(job, 0)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    assert handlers == [signal.SIG_IGN, worker._interrupt_once]
+
+
+def test_a_refused_combination_is_pruned_not_fatal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(spec: Any, folder: Any, after_eval: Any) -> None:
+        if spec.variant == "trial_1":
+            raise studies.ConfigError("no room")
+
+    quick(monkeypatch, refuse)
+    assert tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY)) == 0
+    assert load(tmp_path).trials[1].user_attrs[REASON] == "refused: no room"
+
+
+def test_plots_and_importances(tmp_path: Path) -> None:
+    study = optuna.create_study(direction="maximize", study_name="toy")
+    study.set_user_attr("settings", {"objective": "auc"})
+    assert write_plots(study, tmp_path) == []
+    rng = np.random.default_rng(0)
+    space = {n: optuna.distributions.FloatDistribution(0, 1) for n in ("matters", "idle")}
+    for _ in range(40):
+        x, y = rng.random(2)
+        params = {"matters": x, "idle": y}
+        study.add_trial(optuna.create_trial(params=params, distributions=space, value=x))
+    shares = importances(study)
+    assert shares["matters"] > 5 * shares["idle"]
+    assert [p.name for p in write_plots(study, tmp_path)] == ["history.png", "importances.png"]
+
+
+def test_equal_trials_have_no_importances() -> None:
+    study = optuna.create_study(direction="maximize")
+    for x in np.linspace(0, 1, 10):
+        distributions = {"idle": optuna.distributions.FloatDistribution(0, 1)}
+        study.add_trial(optuna.create_trial(params={"idle": float(x)}, distributions=distributions, value=0.0))
+    assert importances(study) == {}
+
+
+def test_difference_is_what_merging_needs() -> None:
+    assert difference({"a": 1, "b": {"c": 1, "d": 2}}, {"a": 1, "b": {"c": 1, "d": 3}, "e": None}) == {
+        "b": {"d": 3},
+        "e": None,
+    }
+    assert difference({"a": 1}, {"a": True}) == {"a": True}
+
+
+def test_help_needs_no_optuna() -> None:
+    code = "import sys, sb3_tbc.tune; print('optuna' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.stdout.strip() == "False", done.stderr

@@ -1,0 +1,169 @@
+"""Real worker processes: one is killed within a trial; the trial is run again, nothing is lost or counted twice."""
+
+from __future__ import annotations
+
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import optuna
+import pytest
+from optuna.trial import TrialState
+
+from sb3_tbc.tune.study import COUNTED, ORIGIN, WORKER, count_done, open_storage
+
+HERE = Path(__file__).parent
+NAME = "tbc-hrl-TunedCorridor-v0"
+GRACE = 8
+N_TRIALS = 3
+
+
+def command(folder: Path, storage: str, *more: str) -> list[str]:
+    tiny = ["compile:false", "gradient_ratio:0.02", "low.buffer_size:2000", "high.buffer_size:500", "n_timesteps:200"]
+    fixed = ["--env", "tuned_corridor:TunedCorridor-v0", "--log-folder", str(folder), "--storage", storage]
+    short = ["--eval-freq", "100", "--n-eval-episodes", "1", "--n-final-episodes", "1", "--pruner", "none"]
+    size = ["--n-trials", str(N_TRIALS), "--grace-seconds", str(GRACE)]
+    return [sys.executable, "-m", "sb3_tbc.tune", *fixed, *short, *size, "--hyperparams", *tiny, *more]
+
+
+def start(arguments: list[str], log: Path) -> subprocess.Popen[bytes]:
+    environment = {**os.environ, "PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
+    with log.open("wb") as output:
+        return subprocess.Popen(arguments, stdout=output, stderr=output, env=environment, start_new_session=True)
+
+
+def wait_for(condition: Callable[[], bool], seconds: float, log: Path) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, log.read_text()
+        time.sleep(0.2)
+
+
+def kill_one_worker_within_a_trial(folder: Path, storage: str) -> tuple[optuna.Study, int]:
+    """Search with two workers, kill one of them in its trial, let the other finish; the study and the killed trial."""
+    log = folder / "tune.log"
+    process = start(command(folder, storage, "--workers", "2"), log)
+    try:
+        wait_for(lambda: log.read_text().count(" begins") >= 2, 120, log)
+        study = optuna.load_study(study_name=NAME, storage=open_storage(storage, GRACE))
+        wait_for(lambda: bool(training(study, folder)), 60, log)
+        victim = training(study, folder)[-1]
+        os.kill(int(victim.user_attrs[WORKER].rpartition(":")[2]), signal.SIGKILL)
+        assert process.wait(180) == 0, log.read_text()
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    assert "ended with signal 9; its trial will be run again by another" in log.read_text()
+    return study, victim.number
+
+
+def training(study: optuna.Study, folder: Path) -> list[optuna.trial.FrozenTrial]:
+    """Trials whose first seed is being trained, so all parameters are chosen."""
+    running = [t for t in study.trials if t.state == TrialState.RUNNING and WORKER in t.user_attrs]
+    return [t for t in running if (folder / NAME / f"trial_{t.number:04d}" / "seed_0" / "config.yml").is_file()]
+
+
+def check(study: optuna.Study, killed: int) -> None:
+    trials = study.get_trials()
+    assert trials[killed].state == TrialState.FAIL
+    assert count_done(study) == N_TRIALS
+    assert {t.state for t in trials} == {TrialState.COMPLETE, TrialState.FAIL}
+    (retry,) = [t for t in trials if t.system_attrs.get("failed_trial") == killed]
+    assert retry.state == TrialState.COMPLETE
+    assert retry.params == trials[killed].params
+    done = [t for t in trials if t.state in COUNTED]
+    assert [t.user_attrs.get(ORIGIN) for t in done].count("default") == 1
+    assert all(len(t.user_attrs["seed_values"]) == 2 for t in done)
+    assert len({str(t.params) for t in done}) == N_TRIALS
+
+
+@pytest.mark.slow
+def test_a_killed_worker_on_a_journal(tmp_path: Path) -> None:
+    check(*kill_one_worker_within_a_trial(tmp_path, str(tmp_path / "study.log")))
+
+
+@pytest.mark.slow
+def test_a_stop_puts_running_trials_back(tmp_path: Path) -> None:
+    log, storage = tmp_path / "tune.log", str(tmp_path / "study.log")
+    process = start(command(tmp_path, storage, "--workers", "2"), log)
+    try:
+        wait_for(lambda: log.read_text().count(" begins") >= 2, 120, log)
+        os.killpg(process.pid, signal.SIGINT)  # what a terminal's Ctrl-C does: every process gets it
+        assert process.wait(60) == 130, log.read_text()
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+    study = optuna.load_study(study_name=NAME, storage=open_storage(storage, GRACE))
+    states = [t.state for t in study.trials]
+    assert TrialState.RUNNING not in states
+    assert TrialState.WAITING in states
+    done = subprocess.run(
+        command(tmp_path, storage),
+        capture_output=True,
+        text=True,
+        timeout=170,
+        env={**os.environ, "PYTHONPATH": str(HERE)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert count_done(study) == N_TRIALS
+    assert len({str(t.params) for t in study.trials if t.state in COUNTED}) == N_TRIALS
+
+
+# --------------------------------------------------------------------------------------------- PostgreSQL
+
+
+def postgres_folder() -> Path | None:
+    """Where Debian's package (or the PATH) has the server's programs."""
+    found = shutil.which("postgres")
+    if found is not None:
+        return Path(found).resolve().parent
+    installed = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
+    return installed[-1].parent if installed else None
+
+
+if postgres_folder() is not None:  # scripts/install-postgres.sh brings it
+
+    @pytest.fixture
+    def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+        """A private server on a socket in a temporary folder; gives the URL. It refuses to run as root."""
+        programs = postgres_folder()
+        assert programs is not None
+        folder = Path("/tmp") / f"sb3_tbc_postgres_{os.getpid()}"  # a socket's path must be short
+        folder.mkdir(mode=0o777)
+        prefix: list[str] = []
+        if os.getuid() == 0:
+            account = pwd.getpwnam("postgres")
+            os.chown(folder, account.pw_uid, account.pw_gid)
+            prefix = ["runuser", "-u", "postgres", "--"]
+
+        def run(program: str, *arguments: str) -> None:
+            subprocess.run(
+                [*prefix, str(programs / program), *arguments],
+                check=True,
+                stdout=subprocess.DEVNULL,
+                cwd="/tmp",
+                timeout=120,
+            )
+
+        data = str(folder / "data")
+        try:
+            run("initdb", "-D", data, "-U", "tuner", "--auth=trust", "--no-sync", "-E", "UTF8")
+            options = f"-k {folder} -c listen_addresses='' -c fsync=off"
+            run("pg_ctl", "-D", data, "-w", "-l", str(folder / "log"), "-o", options, "start")
+            try:
+                run("createdb", "-h", str(folder), "-U", "tuner", "studies")
+                yield f"postgresql+psycopg://tuner@/studies?host={folder}"
+            finally:
+                run("pg_ctl", "-D", data, "-w", "-m", "immediate", "stop")
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+    @pytest.mark.slow
+    def test_a_killed_worker_on_postgresql(tmp_path: Path, postgres: str) -> None:
+        check(*kill_one_worker_within_a_trial(tmp_path, postgres))

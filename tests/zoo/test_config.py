@@ -1,0 +1,244 @@
+"""Configurations: merging, checking, and every value against the paper's tables."""
+
+from __future__ import annotations
+
+import inspect
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from sb3_tbc import TBCHRL
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.tbc_hrl.config import LEVEL_DEFAULTS
+from sb3_tbc.zoo.algorithms import build_model
+from sb3_tbc.zoo.config import RunConfig, config_file, load_config, merge, parse_overrides, read_file
+from sb3_tbc.zoo.environments import make_envs, task_names
+from sb3_tbc.zoo.schema import LEVEL, MODEL
+
+TABLES = yaml.safe_load((Path(__file__).parents[1] / "data" / "paper_tables.yaml").read_text())
+TASKS = sorted(TABLES["table_1_environments"])
+WINDOW_CAPS = {  # episode length / action budget, as in the public HiTS files
+    "AntFourRooms": 31.8182,
+    "Drawbridge": 200.0,
+    "Pendulum": 45.4545,
+    "Platforms": 50.0,
+    "Tennis2D": 62.5,
+    "UR5Reacher": 25.0,
+}
+COLUMN = {"tbc-hrl": "TBC-HRL", "hits": "HiTS", "hac": "HAC"}
+PEERS = yaml.safe_load((Path(__file__).parents[1] / "data" / "peer_hyperparameters.yaml").read_text())
+
+
+def entropy(value: Any) -> Any:
+    """Table A2's ``target`` is automatic temperature."""
+    return "auto" if isinstance(value, str) and value.startswith(("auto", "target")) else value
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("algo", sorted(COLUMN))
+def test_paper_configuration_is_table_a2(algo: str, task: str) -> None:
+    row = TABLES["table_a2_hyperparameters"][COLUMN[algo]][task]
+    run = load_config(algo, task, "paper")
+    assert run.n_timesteps == TABLES["table_1_environments"][task]["training_steps"]
+    assert run.model["max_options"] == row["max_actions"]
+    if algo == "hac":
+        assert run.model["dt_max"] == (27 if task == "AntFourRooms" else -1)
+    else:
+        assert run.model["dt_max"] == row["dt_max"]
+    assert run.model.get("kappa") == row.get("kappa")
+    assert run.model["n_hindsight_goals"] == row["hindsight"]
+    for level, alpha in zip(("low", "high"), row["alpha"], strict=True):
+        settings = run.model[level]
+        assert settings["learning_rate"] == float(row["lr"])
+        assert settings["batch_size"] == row["batch"]
+        assert settings["tau"] == float(row["polyak"])
+        assert entropy(settings["ent_coef"]) == entropy(alpha)
+        assert "n_hindsight_goals" not in settings
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_flat_paper_configuration_is_table_a2(task: str) -> None:
+    row = TABLES["table_a2_hyperparameters"]["SAC"][task]
+    run = load_config("sac", task, "paper")
+    assert run.n_timesteps == TABLES["table_1_environments"][task]["training_steps"]
+    model = run.model
+    assert (model["learning_rate"], model["batch_size"], model["tau"]) == (row["lr"], row["batch"], row["polyak"])
+    assert model["n_hindsight_goals"] == row["hindsight"]
+    assert entropy(model["ent_coef"]) == entropy(row["alpha"][0])
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_peers_settings_where_the_paper_is_silent(task: str) -> None:
+    """Discounts, widths, update ratios, hindsight places, target entropies of the public files."""
+    for algo in ("hac", "sac"):
+        model, levels = load_config(algo, task, "paper").model, PEERS[task][algo]
+        assert model["gradient_ratio"] == levels[0]["grad_steps_per_env_step"]
+        assert algo == "sac" or model["learning_starts"] == levels[0]["learning_starts"]
+        for name, peer in zip(("low", "high") if algo == "hac" else ("flat",), levels, strict=True):
+            ours = model if algo == "sac" else {**model[name], **model[name]["policy_kwargs"]}
+            widths = ours["net_arch"] if algo == "hac" else model["policy_kwargs"]["net_arch"]
+            assert widths == peer["hidden_layers"]
+            assert ours["gamma"] == peer["gamma"]
+            if "target_entropy" in peer:
+                assert ours["target_entropy"] == peer["target_entropy"]
+            strategy = ours.get("goal_strategy", model["goal_strategy"])
+            assert strategy == {"Tennis2DGSS": "event"}.get(*[peer["goal_sampling_strategy"]] * 2)
+        if algo == "hac":
+            assert model["max_options"] == levels[1]["max_n_actions"]
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_wiring_is_table_a1(task: str) -> None:
+    table = TABLES["table_a1_ndbcnet"][task]
+    paper, tuned = (load_config("tbc-hrl", task, c).model["low"]["policy_kwargs"]["ndbc"] for c in ("paper", "tuned"))
+    assert {k: paper[k] for k in table} == table
+    # `tuned` may depart in the fans, and has larger circuits for the ant's eight motors and for the racket
+    layers = ("motor",) if task in ("AntFourRooms", "Tennis2D") else ("inter", "command", "motor")
+    assert {k: tuned[k] for k in layers} == {k: table[k] for k in layers}
+
+
+def test_paper_reading_of_the_window_end() -> None:
+    assert load_config("tbc-hrl", "Pendulum", "paper").model["window_end"] == "reached"
+    assert load_config("hits", "Pendulum", "paper").model["window_end"] == "timed"
+    assert load_config("hits", "Pendulum").model["low"]["policy_kwargs"]["ndbc"] is None
+
+
+def test_tuned_is_the_default_where_it_exists() -> None:
+    assert load_config("tbc-hrl", "Pendulum").config == "tuned"
+    assert load_config("hits", "UR5Reacher").config == "paper"
+    assert load_config("tbc-hrl", "Pendulum") == load_config("tbc-hrl", "Pendulum", "tuned")
+
+
+def test_deep_merge_keeps_sisters() -> None:
+    base = {"low": {"gamma": 0.99, "policy_kwargs": {"net_arch": [3], "ndbc": {"inter": 2}}}, "n": 1}
+    change = {"low": {"tau": 0.1, "policy_kwargs": {"ndbc": None}}}
+    expected = {"low": {"gamma": 0.99, "tau": 0.1, "policy_kwargs": {"net_arch": [3], "ndbc": None}}, "n": 1}
+    assert merge(base, change) == expected
+    assert base["low"]["policy_kwargs"] == {"net_arch": [3], "ndbc": {"inter": 2}}
+
+
+def test_order_default_task_tuned_command_line(tmp_path: Path) -> None:
+    path = tmp_path / "a.yml"
+    path.write_text(
+        "default: {n_timesteps: 10, dt_min: 1, low: {gamma: 0.9, tau: 0.1}, tuned: {dt_min: 2}}\n"
+        "T: {low: {gamma: 0.8}, tuned: {low: {gamma: 0.7}}}\n"
+    )
+    paper = load_config("x", "T", "paper", path=path)
+    assert paper.model == {"dt_min": 1, "low": {"gamma": 0.8, "tau": 0.1}}
+    tuned = load_config("x", "T", path=path, overrides=parse_overrides(["low.tau:5e-1", "n_timesteps:2e1"]))
+    assert tuned.model == {"dt_min": 2, "low": {"gamma": 0.7, "tau": 0.5}}
+    assert tuned.n_timesteps == 20
+    assert isinstance(tuned.n_timesteps, int)
+    assert load_config("x", "AnotherEnv-v0", "paper", path=path).model["dt_min"] == 1
+
+
+def test_number_like_strings_become_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "a.yml"
+    path.write_text("T: {n_timesteps: 1e3, low: {learning_rate: 3e-4, ent_coef: auto_0.1, batch_size: 1e2}}\n")
+    low = load_config("x", "T", path=path).model["low"]
+    assert low == {"learning_rate": 3e-4, "ent_coef": "auto_0.1", "batch_size": 100}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "T: {low: {lerning_rate: 1}}",
+            r"a\.yml, section T: low: unknown key 'lerning_rate'; did you mean 'learning_rate'",
+        ),
+        ("T: {max_option: 1}", r"a\.yml, section T: unknown key 'max_option'; did you mean 'max_options'"),
+        ("T: {tuned: {dt_mim: 1}}", r"tuned: unknown key 'dt_mim'; did you mean 'dt_min'"),
+        ("T: {window_end: soon}", r"window_end must be one of reached, timed, got 'soon'"),
+        ("T: {low: {batch_size: 1.5}}", r"batch_size must be int, got 1\.5"),
+        ("T: {low: {gamma: true}}", r"gamma must be int or float, got True"),
+        ("T: {low: 3}", r"low must be a section"),
+        ("T: 3", r"expected sections"),
+        ("T: {a: [}", r"cannot read configuration"),
+        ("T: {subgoals: {thresholds: 0.1}}", r"neither section T nor section default of .*a\.yml says n_timesteps"),
+        ("T: {n_timesteps: 0}", r"n_timesteps and n_envs must be positive"),
+    ],
+)
+def test_mistakes_name_file_section_and_cure(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "a.yml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_config("x", "T", path=path)
+
+
+def test_command_line_values_are_data_not_code() -> None:
+    assert parse_overrides(["low.policy_kwargs.net_arch:[64, 64]", "compile:false"]) == {
+        "low": {"policy_kwargs": {"net_arch": [64, 64]}},
+        "compile": False,
+    }
+    for item in ("low.gamma:__import__('os').getcwd()", "low.gamma:!!python/object/apply:os.getcwd []"):
+        with pytest.raises(ConfigError):
+            parse_overrides([item])
+    with pytest.raises(ConfigError, match="takes key:value"):
+        parse_overrides(["gamma"])
+    with pytest.raises(ConfigError, match="did you mean 'learning_rate'"):
+        parse_overrides(["low.learningrate:1"])
+
+
+def test_unknown_names() -> None:
+    with pytest.raises(ConfigError, match="did you mean 'tbc-hrl'"):
+        config_file("tbc_hrl")
+    with pytest.raises(ConfigError, match="paper, tuned"):
+        load_config("tbc-hrl", "Pendulum", "best")
+
+
+def test_a_run_configuration_survives_yaml() -> None:
+    run = load_config("tbc-hrl", "UR5Reacher")
+    assert RunConfig.from_dict(yaml.safe_load(yaml.safe_dump(run.to_dict()))) == run
+    with pytest.raises(ConfigError, match=r"not a run's config\.yml"):
+        RunConfig.from_dict({"algo": "x"})
+
+
+@pytest.mark.parametrize("algo", [*sorted(COLUMN), "sac"])
+def test_every_shipped_section_is_a_task(algo: str) -> None:
+    assert set(read_file(config_file(algo))) == {"default", *TASKS}
+
+
+def test_the_schema_is_what_the_agent_takes() -> None:
+    taken = set(inspect.signature(TBCHRL).parameters)
+    given_by_the_runner = {"env", "seed", "device", "verbose", "tensorboard_log", "stats_window_size"}
+    assert set(MODEL) == taken - given_by_the_runner - {"subgoals", "_init_setup_model"}
+    assert set(LEVEL) == {*LEVEL_DEFAULTS, "n_hindsight_goals", "goal_strategy", "near_misses"}
+
+
+@pytest.mark.parametrize("config", ["paper", "tuned"])
+@pytest.mark.parametrize("algo", sorted(COLUMN))
+@pytest.mark.parametrize("task", TASKS)
+def test_every_shipped_section_builds(task: str, algo: str, config: str) -> None:
+    small = parse_overrides(["low.buffer_size:1000", "high.buffer_size:1000", "compile:false"])
+    run = load_config(algo, task, config, small)
+    env = make_envs(task_names()[task], 1, 0, run.env_kwargs)
+    try:
+        model = build_model(run, env, seed=0)
+    finally:
+        env.close()
+    circuit = run.model["low"]["policy_kwargs"].get("ndbc")
+    state_dim = model.low.policy.actor.state_dim
+    assert state_dim == (0 if circuit is None else circuit["inter"] + circuit["command"] + circuit["motor"])
+    assert model.rules.window_end == run.model["window_end"]
+    cap = (
+        {"AntFourRooms": 27.0, "Pendulum": 37.037}.get(task, WINDOW_CAPS[task]) if algo == "hac" else WINDOW_CAPS[task]
+    )
+    budgets = (
+        load_config(algo, task, "paper").model["max_options"],
+        run.model["max_options"],
+    )  # `tuned` may have its own
+    own = run.model["dt_max"]
+    assert model.rules.dt_max == pytest.approx(cap * budgets[0] / budgets[1] if own == -1 else own, abs=2e-3)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_flat_section_builds(task: str) -> None:
+    run = load_config("sac", task, None, parse_overrides(["buffer_size:1000"]))
+    env = make_envs(task_names()[task], 1, 0, run.env_kwargs)
+    try:
+        model = build_model(run, env, seed=0)
+    finally:
+        env.close()
+    assert model.gradient_steps == round(100 * run.model["gradient_ratio"])

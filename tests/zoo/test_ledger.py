@@ -1,0 +1,133 @@
+"""Run folders and the ledger: what is written, what is refused, what survives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.files import write_atomic
+from sb3_tbc.zoo import ledger
+from sb3_tbc.zoo.callbacks import EvaluationRow, read_evaluations, write_evaluations
+from sb3_tbc.zoo.ledger import RunFolder, curve_summary, finished_runs, summarise, to_json
+
+ROW = EvaluationRow(1000, 0.5, 20, 312.25, 0.25, 21.5, 12.5)
+
+
+def episodes(successes: list[bool], lengths: list[int]) -> Any:
+    n = len(successes)
+    share, window = np.full(n, 0.25), np.full(n, np.nan)
+    return SimpleNamespace(
+        successes=np.array(successes), lengths=np.array(lengths), subgoal_success=share, mean_window=window
+    )
+
+
+def test_summary_has_the_pinned_keys_and_no_nan() -> None:
+    summary = summarise(episodes([True, False, True, True], [100, 1000, 200, 300]))
+    assert summary["n_episodes"] == 4
+    assert summary["success_rate"] == 0.75
+    assert summary["mean_length"] == 400.0
+    assert summary["mean_length_success"] == 200.0
+    assert summary["subgoal_success"] == 0.25
+    assert summary["mean_window"] is None
+    low, high = summary["success_ci95"]
+    assert 0.0 < low < 0.75 < high < 1.0
+    assert json.loads(to_json(summary)) == summary
+    assert summarise(episodes([False], [9]))["mean_length_success"] is None
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        to_json({"x": float("nan")})
+
+
+def test_folder_layout(tmp_path: Path) -> None:
+    folder = RunFolder.of(tmp_path, "Pendulum", "tbc-hrl", "full", 3)
+    assert folder.path == tmp_path / "Pendulum" / "tbc-hrl" / "full" / "seed_3"
+    foreign = RunFolder.of(tmp_path, "my_module:ns/Env-v0", "hits", "full", 0)
+    assert foreign.path.relative_to(tmp_path).parts[0] == "my_module_ns_Env-v0"
+
+
+def test_life_of_a_run(tmp_path: Path) -> None:
+    folder = RunFolder.of(tmp_path / "runs", "T", "a", "full", 0)
+    assert not folder.exists
+    folder.start({"algo": "a", "model": {"gamma": 0.9}}, "python -m x")
+    write_evaluations(folder.evaluations, [ROW, ROW._replace(timesteps=2000)])
+    assert folder.exists
+    assert not folder.finished
+    assert folder.read_config() == {"algo": "a", "model": {"gamma": 0.9}}
+    folder.drop_evaluations_after(1500)
+    assert folder.read_evaluations() == [ROW]
+    folder.finish({"task": "T", "success_rate": 1.0})
+    assert [f.path for f in finished_runs(tmp_path / "runs")] == [folder.path]
+    (folder.path / "model.zip").write_bytes(b"large")
+
+    target = RunFolder.of(tmp_path / "results", "T", "a", "full", 0)
+    folder.copy_to(target)
+    assert sorted(p.name for p in target.path.iterdir()) == sorted(ledger.LEDGER_FILES)
+    with pytest.raises(ConfigError, match="already holds a result"):
+        folder.copy_to(target)
+
+    (folder.path / "notes.txt").write_text("mine")
+    folder.clear()
+    assert [p.name for p in folder.path.iterdir()] == ["notes.txt"]
+
+
+def test_versions_name_what_matters() -> None:
+    versions = ledger.versions()
+    assert {"stable_baselines3", "torch", "numpy"} <= set(versions["packages"])
+    assert versions["cpu"]
+    assert versions["torch_threads"] == 1
+
+
+def test_broken_files_are_named(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    with pytest.raises(ConfigError, match=r"holds no run: config\.yml is missing"):
+        folder.read_config()
+    (tmp_path / "final.json").write_text("{")
+    with pytest.raises(ConfigError, match=r"cannot read .*final\.json"):
+        folder.read_final()
+    (tmp_path / "final.json").write_text("[]")
+    with pytest.raises(ConfigError, match="must hold named values"):
+        folder.read_final()
+
+
+def test_evaluations_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "evaluations.csv"
+    assert read_evaluations(path) == []
+    rows = [ROW, ROW._replace(timesteps=2000, subgoal_success=float("nan"))]
+    write_evaluations(path, rows)
+    assert path.read_text().splitlines()[0] == (
+        "timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,wall_time"
+    )
+    back = read_evaluations(path)
+    assert back[0] == ROW
+    assert np.isnan(back[1].subgoal_success)
+    path.write_text("steps,rate\n1,2\n")
+    with pytest.raises(ValueError, match="must have the columns"):
+        read_evaluations(path)
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "final.json"
+    write_atomic(path, "old")
+
+    def fail(*_: Any, **__: Any) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Path, "write_text", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomic(path, "new")
+    assert path.read_text() == "old"
+
+
+def test_curve_summary() -> None:
+    rows = [ROW._replace(success_rate=rate) for rate in (0.1, 0.95, 0.8, 1.0)]
+    assert curve_summary(rows) == {
+        "best_success_rate": 1.0,
+        "stable_share": pytest.approx(2 / 3),
+        "worst_after_first_90": 0.8,
+    }
+    assert curve_summary([])["best_success_rate"] is None

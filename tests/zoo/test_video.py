@@ -1,0 +1,64 @@
+"""Videos: frames carry the overlay, the file appears whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from sb3_tbc import TBCHRL
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.zoo.video import episode_frames, record_video
+
+ENV_ID = "sb3_tbc/Drawbridge-v0"
+
+
+@pytest.fixture(scope="module")
+def model() -> TBCHRL:
+    return TBCHRL("MultiInputPolicy", gym.make(ENV_ID), seed=0, max_options=2, dt_max=12, compile=False)
+
+
+def test_frames_follow_the_live_option(model: TBCHRL, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    seen = []
+    original = env.unwrapped.set_overlay
+    monkeypatch.setattr(
+        env.unwrapped,
+        "set_overlay",
+        lambda subgoal=None, time_left=None, text=None: (
+            seen.append((subgoal, time_left, text)),
+            original(subgoal, time_left, text),
+        ),
+    )
+    frames = list(episode_frames(model, env, seed=0))
+    assert len(frames) == len(seen)
+    assert all(frame.dtype == np.uint8 and frame.ndim == 3 for frame in frames)
+    assert all(side % 2 == 0 for side in frames[0].shape[:2])
+    times = [time for _, time, _ in seen[:-1]]
+    assert all(0.0 <= time <= 1.0 for time in times)
+    changes = [i for i in range(1, len(times)) if times[i] > times[i - 1]]
+    assert len(changes) <= 1  # two options: time runs down, jumps once, runs down
+    assert seen[-1][2].endswith("action budget used up")
+
+
+def test_the_file_is_written_whole(model: TBCHRL, tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    path = tmp_path / "videos" / "a.mp4"
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    record_video(model, env, path, n_episodes=1)
+    assert path.stat().st_size > 1000
+    assert [p.name for p in path.parent.iterdir()] == ["a.mp4"]
+    with pytest.raises(ConfigError, match=r"must end in \.mp4"):
+        record_video(model, env, tmp_path / "a.gif")
+
+
+def test_what_cannot_be_drawn_costs_one_line(model: TBCHRL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    for picture, message in ((lambda: None, "render_mode"), (lambda: 1 / 0, "division by zero; .* MUJOCO_GL=egl")):
+        monkeypatch.setattr(env.unwrapped, "render", picture)
+        with pytest.raises(ConfigError, match=f"cannot be drawn: .*{message}"):
+            record_video(model, env, tmp_path / "a.mp4")
+    assert not list(tmp_path.iterdir())
