@@ -1,0 +1,81 @@
+"""What README and the pages say exists: links between pages, modules, commands, settings; the figures of the ledger."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from sb3_tbc.commands import COMMANDS
+
+ROOT = Path(__file__).parents[1]
+DERIVED = {"commands.md", "settings.md"}  # written when the pages are built
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in DERIVED)]
+NOTES = sorted((ROOT / "results" / "notes").glob("*.md"))
+
+
+def pages(paths: list[Path]) -> list[object]:
+    return [pytest.param(path, id=path.relative_to(ROOT).as_posix()) for path in paths]
+
+
+@pytest.mark.parametrize("page", pages([*PAGES, *NOTES]))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        if not target.startswith(("http", "mailto")) and Path(target).name not in DERIVED:
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+@pytest.mark.parametrize("page", pages(PAGES))
+def test_modules_and_names_exist(page: Path) -> None:
+    for name in set(re.findall(r"\bsb3_tbc(?:\.[A-Za-z_]\w*)+", page.read_text(encoding="utf-8"))):
+        if name.removeprefix("sb3_tbc.") in COMMANDS:
+            continue
+        module, _, attribute = name.rpartition(".")
+        try:
+            found = find_spec(name) is not None
+        except ModuleNotFoundError:
+            found = False
+        assert found or hasattr(importlib.import_module(module), attribute), f"{page.name}: {name}"
+
+
+@pytest.mark.parametrize("page", pages(PAGES))
+def test_commands_exist(page: Path) -> None:
+    for name in re.findall(r"(?:-m sb3_tbc\.|sb3-tbc )([a-z]+)\b", page.read_text(encoding="utf-8")):
+        assert name in COMMANDS or find_spec(f"sb3_tbc.{name}") is not None, f"{page.name}: {name}"
+
+
+def test_the_package_index_page_has_no_relative_links() -> None:
+    text = (ROOT / "docs" / "package_index.md").read_text(encoding="utf-8")
+    assert not [t for t in re.findall(r"\]\(([^)]+)\)", text) if not t.startswith("http")]
+
+
+ROWS = {"Pendulum": "hits", "UR5Reacher": "hits", "Drawbridge": "hits", "AntFourRooms": "hits", "Tennis2D": "hits"}
+
+
+@pytest.mark.parametrize("task", [*ROWS, "Platforms"])
+def test_readmes_results_are_the_ledgers(task: str) -> None:
+    row = next(line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith(f"| {task}"))
+    finals = [json.loads(p.read_text()) for p in (ROOT / "results" / task / "tbc-hrl" / "full").glob("*/final.json")]
+    mean = sum(final["success_rate"] for final in finals) / len(finals)
+    said = re.findall(r"(?<![\d.])(1\.00|\.\d\d)", row)[0]
+    assert float(said) == round(mean, 2)
+    assert f"| {len(finals)} |" in row
+
+
+@pytest.mark.slow
+def test_the_pages_build_without_a_warning(tmp_path: Path) -> None:
+    pytest.importorskip("furo", reason="needs the docs extra")
+    command = [sys.executable, "-m", "sphinx", "-W", "-q", "-b", "html", str(ROOT / "docs"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr
+    for page in tmp_path.glob("*.html"):
+        loaded = re.findall(
+            r"<(?:script|link|img)[^>]+(?:src|href)=\"(https?:[^\"]+)\"", page.read_text(encoding="utf-8")
+        )
+        assert not loaded, f"{page.name} loads {loaded}"
