@@ -42,7 +42,8 @@ def mark(kind: str, x: float, y: float, colour: str) -> str:
     if kind == "circle":
         return f'<circle cx="{x:.1f}" cy="{y:.1f}" r="6" fill="{colour}"/>'
     if kind == "square":
-        return f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" fill="none" stroke="{colour}" stroke-width="2.5"/>'
+        style = f'fill="none" stroke="{colour}" stroke-width="2.5"'
+        return f'<rect x="{x - 5:.1f}" y="{y - 5:.1f}" width="10" height="10" {style}/>'
     return f'<path d="M{x:.1f} {y - 9:.1f}V{y + 9:.1f}" stroke="{colour}" stroke-width="4"/>'
 
 

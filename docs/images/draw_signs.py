@@ -1,4 +1,4 @@
-"""Draw the curves of docs/signs_of_trouble.md. The numbers are of real runs, named beside them; the page has the tables."""
+"""Draw the curves of docs/signs_of_trouble.md. The numbers are of real runs; the page names them."""
 
 from __future__ import annotations
 
