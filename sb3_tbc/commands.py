@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import signal
 import sys
-from collections.abc import Callable, Sequence
-from typing import NamedTuple, NoReturn
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple, NoReturn
 
 from sb3_tbc.errors import ConfigError
 
@@ -23,18 +24,46 @@ class Command(NamedTuple):
 
 COMMANDS = {
     "train": Command("sb3_tbc.train", "train an agent on a task"),
-    "evaluate": Command("sb3_tbc.evaluate", "success rate of a saved agent, and a film of it"),
+    "evaluate": Command("sb3_tbc.evaluate", "measure a saved agent's success rate, film it or watch it"),
     "tune": Command("sb3_tbc.tune.command", "search settings for a task"),
-    "reproduce": Command("sb3_tbc.reproduce", "run the paper's experiments; stopped ones go on"),
-    "report": Command("sb3_tbc.report.command", "tables and learning curves of finished runs"),
+    "reproduce": Command("sb3_tbc.reproduce", "run the paper's experiments, on this machine or a cluster"),
+    "report": Command("sb3_tbc.report.command", "tables, statistics and learning curves of finished runs"),
     "export": Command("sb3_tbc.export.command", "write an agent as C, ONNX or NumPy code for a robot"),
     "benchmark": Command("sb3_tbc.benchmark.command", "measure speed beside other packages"),
 }
 """Every command by name: the console script, the tests and the docs are made from this table."""
 
 
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Help texts that end with the default value, where there is one and the text does not name it."""
+
+    def __init__(self, prog: str) -> None:
+        super().__init__(prog, max_help_position=30, width=min(shutil.get_terminal_size().columns, 110))
+
+    def _get_help_string(self, action: argparse.Action) -> str | None:
+        text = action.help
+        unsaid = action.default in (None, False, [], argparse.SUPPRESS) or action.option_strings == []
+        if text is None or unsaid or "default" in text:
+            return text
+        return f"{text} (default: %(default)s)"
+
+
 class Parser(argparse.ArgumentParser):
-    """An argument parser whose errors are one line on standard error, without the usage text."""
+    """An argument parser whose help ends with examples and whose errors are one line, without the usage text.
+
+    :param prog: name of the command in messages
+    :param examples: command lines (without ``python -m``) and what each is for
+    :param description: what the command does, e.g. its module's docstring
+    :param settings: as for :class:`argparse.ArgumentParser`
+    """
+
+    def __init__(
+        self, prog: str, examples: Mapping[str, str] | None = None, description: str | None = None, **settings: Any
+    ) -> None:
+        lines = [f"  # {purpose}\n  python -m {line}" for line, purpose in (examples or {}).items()]
+        epilog = "examples:\n" + "\n".join(lines) if lines else None
+        text = (description or "").replace("``", "")
+        super().__init__(prog, description=text, formatter_class=HelpFormatter, epilog=epilog, **settings)
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and exit with status 2."""

@@ -1,9 +1,9 @@
-"""``python -m sb3_tbc.evaluate``: success rate of a saved agent with its interval, subgoals, windows; video too."""
+"""``python -m sb3_tbc.evaluate``: measure a saved agent's success rate, film it, or watch it in a window."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch as th
 
 from sb3_tbc.commands import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, load_model, read_zip
@@ -18,20 +19,31 @@ from sb3_tbc.zoo.environments import NAMESPACE, make_env, resolve_env
 from sb3_tbc.zoo.ledger import summarise, to_json
 from sb3_tbc.zoo.runner import evaluation_envs
 
+EXAMPLES = {
+    "sb3_tbc.evaluate runs/Pendulum/tbc-hrl/full/seed_0/model.zip": "100 episodes, and a summary of them",
+    "sb3_tbc.evaluate model.zip --video film.mp4 --video-episodes 5": "film five episodes as well",
+    "sb3_tbc.evaluate model.zip --json - > result.json": "figures for a program, nothing else on standard output",
+    "sb3_tbc.evaluate model.zip --render --n-episodes 3": "watch three episodes in a window, then count them",
+}
+
 
 def build_parser() -> Parser:
     """The command's arguments."""
-    parser = Parser("sb3_tbc.evaluate", description=__doc__)
-    parser.add_argument("model", type=Path, metavar="MODEL.zip")
+    parser = Parser("sb3_tbc.evaluate", EXAMPLES, description=__doc__)
+    parser.add_argument(
+        "model", type=Path, metavar="MODEL.zip", help="the agent; train and model.save write such files"
+    )
     parser.add_argument("--env", help="task or goal environment id; by default the one the agent was trained on")
-    parser.add_argument("--n-episodes", type=positive_int, default=100)
-    parser.add_argument("--seed", type=int, default=0, help="of the episodes")
-    parser.add_argument("--stochastic", action="store_true", help="sample actions as in training")
-    parser.add_argument("--json", type=Path, metavar="OUT", help="write exactly what is printed")
-    parser.add_argument("--video", type=Path, metavar="OUT.mp4", help="record episodes with subgoal and remaining time")
-    parser.add_argument("--video-episodes", type=positive_int, default=3)
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--num-threads", type=positive_int, default=1)
+    parser.add_argument("--n-episodes", type=positive_int, default=100, help="episodes to count")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions as in training, instead of the means")
+    parser.add_argument("--json", metavar="OUT", help="write the figures as JSON to this file and to standard output, "
+                        "the summary to standard error; with - to standard output only")  # fmt: skip
+    parser.add_argument("--video", type=Path, metavar="OUT.mp4", help="film episodes with subgoal and remaining time")
+    parser.add_argument("--video-episodes", type=positive_int, default=3, help="episodes in the film")
+    parser.add_argument("--render", action="store_true", help="show episodes in a window before they are counted")
+    parser.add_argument("--device", default="cpu", help="torch device")
+    parser.add_argument("--num-threads", type=positive_int, default=1, help="torch threads")
     return parser
 
 
@@ -73,23 +85,83 @@ def evaluate(
     return {**identity, "n_timesteps": int(model.num_timesteps), **summarise(result), "eval_seed": seed}
 
 
+def describe(result: Mapping[str, Any]) -> str:
+    """A few lines for a person; figures that an agent does not have (a flat one has no subgoals) are left out."""
+    low, high = result["success_ci95"]
+    count = round(result["success_rate"] * result["n_episodes"])
+    lines = [
+        f"agent            {result['algo']} ({result['variant']}), {result['n_timesteps']:,} training steps on "
+        f"{result['task']}",
+        f"success rate     {result['success_rate']:.2f}  ({count} of {result['n_episodes']} episodes; 95 % interval "
+        f"{low:.2f} to {high:.2f})",
+    ]
+    for key, text in FIGURES.items():
+        if result[key] is not None:
+            lines.append(text.format(result[key]))
+    return "\n".join(lines)
+
+
+FIGURES = {
+    "mean_length": "episode length   {:.1f} steps on average",
+    "mean_length_success": "  of successes   {:.1f} steps",
+    "subgoal_success": "subgoals reached {:.2f}  (share of options, mean over episodes)",
+    "mean_window": "option length    {:.1f} steps on average",
+}
+"""Figure of the result -> its line of the summary."""
+
+
 def command(argv: Sequence[str]) -> int:
     """Evaluate; see ``--help``."""
     args = build_parser().parse_args(argv)
+    if args.video is not None:  # told before the episodes are counted, which may take minutes
+        require("imageio", extra="video", what="a film")
     th.set_num_threads(args.num_threads)
     info = identify(args.model, args.env)
-    text = to_json(evaluate(args.model, info, args.n_episodes, args.seed, args.stochastic, args.device))
-    print(text, end="")
-    if args.json is not None:
-        write_atomic(args.json, text)
+    if args.render:
+        _watch(args.model, info, args.n_episodes, args.seed, args.device)
+    result = evaluate(args.model, info, args.n_episodes, args.seed, args.stochastic, args.device)
+    _tell(result, args.json)
     if args.video is not None:
         from sb3_tbc.zoo.video import record_video
 
         env = make_env(info["env_id"], **info["env_kwargs"])
         record_video(load_model(args.model, device=args.device), env, args.video, args.video_episodes, args.seed)
         env.close()
-        print(f"video: {args.video}", file=sys.stderr)
+        print(f"video            {args.video}", file=sys.stderr)
     return 0
+
+
+def _tell(result: Mapping[str, Any], json_out: str | None) -> None:
+    """Print the summary; with ``--json``, standard output is exactly the JSON and the summary goes beside it."""
+    if json_out is None:
+        print(describe(result))
+        return
+    text = to_json(result)
+    print(text, end="")
+    if json_out != "-":
+        write_atomic(Path(json_out), text)
+        print(describe(result), file=sys.stderr)
+
+
+def _watch(path: Path, info: Mapping[str, Any], n_episodes: int, seed: int, device: str) -> None:
+    """Play episodes in a window; episode ``i`` starts from ``seed + i``.
+
+    :raises ConfigError: if the environment cannot be drawn, or there is no display
+    """
+    from sb3_tbc.tasks.window import Window
+    from sb3_tbc.zoo.video import episode_frames
+
+    model, env = load_model(path, device=device), make_env(info["env_id"], **info["env_kwargs"])
+    try:
+        window = Window(f"{info['task']}, {info['algo']}", env.metadata.get("render_fps", 30))
+        for episode in range(n_episodes):
+            for frame in episode_frames(model, env, seed + episode):
+                window.show(frame)
+        window.close()
+    except RuntimeError as error:
+        raise ConfigError(f"--render cannot open a window: {error}") from error
+    finally:
+        env.close()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

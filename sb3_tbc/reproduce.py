@@ -43,26 +43,35 @@ class Job:
         return [*train, "--overwrite", *self.arguments]
 
 
+EXAMPLES = {
+    "sb3_tbc.reproduce --dry-run": "what would run, and how many hours it takes",
+    "sb3_tbc.reproduce --tasks Pendulum --seeds 3 --workers 2": "three seeds of every method, two runs at a time",
+    "sb3_tbc.reproduce --algos tbc-hrl --ablation no-ts --first-seed 100": "an ablation, on fresh seeds",
+}
+
+
 def build_parser() -> Parser:
     """The command's arguments."""
-    parser = Parser("sb3_tbc.reproduce", description=__doc__)
-    parser.add_argument("--tasks", nargs="+", default=sorted(task_names()))
-    parser.add_argument("--algos", nargs="+", default=sorted(ALGORITHMS))
-    parser.add_argument("--seeds", type=positive_int, default=10, help="how many; the paper has 10")
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--workers", type=positive_int, default=1, help="runs at the same time, one thread each")
-    parser.add_argument("--executor", choices=["local"], default="local")
-    parser.add_argument("--config", choices=CONFIGS)
-    parser.add_argument("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
-    parser.add_argument("--variant", help="name of the runs' folder; by default from the configuration")
-    parser.add_argument("--n-timesteps", type=positive_int)
-    parser.add_argument("--eval-freq", type=positive_int)
-    parser.add_argument("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (20)")
-    parser.add_argument("--n-final-episodes", type=positive_int, default=100)
-    parser.add_argument("--hyperparams", nargs="+", default=[], metavar="K:V")
-    parser.add_argument("--log-folder", type=Path, default=Path("runs"))
-    parser.add_argument("--ledger", type=Path, default=Path("results"))
-    parser.add_argument("--dry-run", action="store_true", help="say what is done and what would be run")
+    parser = Parser("sb3_tbc.reproduce", EXAMPLES, description=__doc__)
+    add = parser.add_argument_group("which runs").add_argument
+    add("--tasks", nargs="+", default=sorted(task_names()), help="by default all of them")
+    add("--algos", nargs="+", default=sorted(ALGORITHMS), help="by default all of them: hac, hits, sac, tbc-hrl")
+    add("--seeds", type=positive_int, default=10, help="seeds of each task and method; the paper has 10")
+    add("--first-seed", type=int, default=0, help="the seeds are this one and the next ones")
+    add("--config", choices=CONFIGS, help="values of the settings; by default tuned where there are such")
+    add("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
+    add("--variant", help="name of the runs' folder; by default from --config and --ablation")
+    add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as train takes them")
+    add("--n-timesteps", type=positive_int, help="environment steps of each run; by default the task's")
+    add("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a fortieth")
+    add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (default: 20)")
+    add("--n-final-episodes", type=positive_int, default=100, help="episodes of the evaluation after training")
+    add = parser.add_argument_group("how they are run").add_argument
+    add("--workers", type=positive_int, default=1, help="runs at the same time, one thread each")
+    add("--executor", choices=["local"], default="local", help="where they run")
+    add("--dry-run", action="store_true", help="print what would be run, and stop")
+    add("--log-folder", type=Path, default=Path("runs"), help="folder of the runs")
+    add("--ledger", type=Path, default=Path("results"), help="folder that the small result files are copied to")
     return parser
 
 
@@ -145,7 +154,7 @@ def command(argv: Sequence[str]) -> int:
     try:
         failed = Campaign().run(todo, args.workers)
     except KeyboardInterrupt:
-        print("stopped; the same command goes on", file=sys.stderr)
+        print("stopped; the same command continues", file=sys.stderr)
         return INTERRUPTED
     return 1 if failed else 0
 

@@ -14,6 +14,7 @@ import torch as th
 
 from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.extras import require
 from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm
 from sb3_tbc.zoo.config import CONFIGS, load_config, parse_overrides
@@ -21,38 +22,71 @@ from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
 
+EXAMPLES = {
+    "sb3_tbc.train": "TBC-HRL on Pendulum; the run is kept in runs/Pendulum/tbc-hrl/full/seed_0",
+    "sb3_tbc.train --list": "which tasks and algorithms there are, and how long a run takes",
+    "sb3_tbc.train --algo hits --env UR5Reacher --seed 3": "another method, task and seed",
+    "sb3_tbc.train --hyperparams low.learning_rate:1e-3 max_options:10": "settings of your own",
+    "sb3_tbc.train --resume runs/Pendulum/tbc-hrl/full/seed_0": "continue a run that was stopped",
+}
+
 
 def build_parser() -> Parser:
     """The command's arguments."""
-    parser = Parser("sb3_tbc.train", description=__doc__)
-    parser.add_argument("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
-    parser.add_argument("--env", default="Pendulum", help="a task's short name or any registered goal environment id")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--n-timesteps", type=positive_int, help="environment steps; by default the paper's (table 1)")
-    parser.add_argument("--n-envs", type=positive_int, help="parallel environments")
-    parser.add_argument("--config", metavar="{paper,tuned,FILE.yml}", help="the paper's values, those tuned by "
-                        "measurement (default), or a file with sections like those of zoo_configs")  # fmt: skip
-    parser.add_argument("--config-file", type=Path, help="the file, where paper or tuned is said too")
-    parser.add_argument("--ablation", help="what to leave out: no-ts or no-ndbc")
-    parser.add_argument("--hyperparams", nargs="+", default=[], metavar="K:V", help="e.g. low.learning_rate:1e-3")
-    parser.add_argument("--eval-freq", type=positive_int, help="environment steps between evaluations")
-    parser.add_argument("--n-eval-episodes", type=positive_int, default=20, help="episodes of each evaluation")
-    parser.add_argument("--n-final-episodes", type=positive_int, default=100, help="episodes of the last evaluation")
-    parser.add_argument("--log-folder", type=Path, default=Path("runs"), help="runs go to <folder>/<task>/<algo>/...")
-    parser.add_argument("--variant", help="name of the run's folder; by default full, paper, or the ablation")
-    parser.add_argument("--overwrite", action="store_true", help="replace an earlier run in the same folder")
-    parser.add_argument("--resume", type=Path, metavar="RUN", help="go on with the run in this folder")
-    parser.add_argument("--ledger", type=Path, metavar="FOLDER", help="copy the small result files there when done")
-    parser.add_argument("--device", default="cpu")
-    parser.add_argument("--num-threads", type=positive_int, default=1, help="more than one is slower on small networks")
-    parser.add_argument(
-        "--progress", action=argparse.BooleanOptionalAction, help="progress bar; default: on a terminal"
-    )
-    parser.add_argument("--tensorboard", action="store_true", help="write TensorBoard files into the run's folder")
-    parser.add_argument("--trace", action="store_true", help="write every option of training to options.csv")
-    parser.add_argument("--checkpoint-minutes", type=float, default=10.0, help="time between checkpoints for --resume")
-    parser.add_argument("--keep-checkpoint", action="store_true", help="keep the last checkpoint of a finished run")
+    parser = Parser("sb3_tbc.train", EXAMPLES, description=__doc__)
+    what = parser.add_argument_group("what to train")
+    what.add_argument("--list", action=ListAction, help="print tasks, steps, minutes, extras and algorithms, and stop")
+    what.add_argument("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
+    what.add_argument("--env", default="Pendulum", help="a task's name or the id of any registered goal environment")
+    what.add_argument("--seed", type=int, default=0, help="seed of everything random in the run")
+    what.add_argument("--n-timesteps", type=positive_int, help="environment steps; by default the task's, see --list")
+    what.add_argument("--n-envs", type=positive_int, help="environments side by side; by default the configuration's")
+    what.add_argument("--config", metavar="{paper,tuned,FILE.yml}", help="paper: the values of the paper's tables; "
+                      "tuned: those that measurements improved, the default where there are any; or a file with "
+                      "sections like those of zoo_configs")  # fmt: skip
+    what.add_argument("--config-file", type=Path, metavar="FILE.yml", help="a file of your own, of which --config "
+                      "paper or tuned picks the values; --config FILE.yml alone is shorter")  # fmt: skip
+    what.add_argument("--ablation", help="leave a part out: no-ts (timed subgoals) or no-ndbc (the circuit)")
+    what.add_argument("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, which win "
+                      "over the configuration; dots lead into a level, e.g. low.learning_rate:1e-3")  # fmt: skip
+    watch = parser.add_argument_group("how it is evaluated")
+    watch.add_argument("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a "
+                       "fortieth of the run, at least 500")  # fmt: skip
+    watch.add_argument("--n-eval-episodes", type=positive_int, default=20, help="episodes of each evaluation")
+    watch.add_argument("--n-final-episodes", type=positive_int, default=100, help="episodes of the last evaluation")
+    where = parser.add_argument_group("where it is kept")
+    where.add_argument("--log-folder", type=Path, default=Path("runs"),
+                       help="the run goes to <log-folder>/<task>/<algo>/<variant>/seed_<n>")  # fmt: skip
+    where.add_argument("--variant", help="name of the run's folder; by default full, paper, or the ablation")
+    where.add_argument("--overwrite", action="store_true", help="replace an earlier run in the same folder")
+    where.add_argument("--resume", type=Path, metavar="RUN", help="continue the run in this folder")
+    where.add_argument("--ledger", type=Path, metavar="FOLDER", help="also copy the small result files here at the end")
+    where.add_argument("--trace", action="store_true", help="write every option of training to options.csv, which the "
+                       "report draws")  # fmt: skip
+    where.add_argument("--tensorboard", action="store_true", help="write TensorBoard files into the run's folder")
+    where.add_argument("--checkpoint-minutes", type=float, default=10.0, help="time between checkpoints for --resume")
+    where.add_argument("--keep-checkpoint", action="store_true", help="keep the last checkpoint of a finished run")
+    machine = parser.add_argument_group("machine")
+    machine.add_argument("--device", default="cpu", help="torch device")
+    machine.add_argument("--num-threads", type=positive_int, default=1,
+                         help="torch threads; more than one is slower on networks this small")  # fmt: skip
+    machine.add_argument("--progress", action=argparse.BooleanOptionalAction,
+                         help="progress bar; by default on a terminal")  # fmt: skip
     return parser
+
+
+class ListAction(argparse.Action):
+    """``--list``: print what can be trained and stop, as ``--help`` does."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(nargs=0, **settings)
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
+        """Print and stop."""
+        from sb3_tbc.zoo.catalogue import catalogue
+
+        print(catalogue())
+        parser.exit()
 
 
 def build_spec(args: argparse.Namespace) -> RunSpec:
@@ -60,6 +94,7 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
 
     :raises ConfigError: for unknown names and wrong values
     """
+    args.algo = args.algo.lower()
     algorithm(args.algo)
     task, env_id = resolve_env(args.env)
     overrides = parse_overrides(args.hyperparams)
@@ -82,7 +117,7 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
 
 
 def config_and_file(args: argparse.Namespace) -> tuple[str | None, Path | None]:
-    """``paper`` or ``tuned``, and the file: ``--config`` takes either.
+    """Which values (``paper`` or ``tuned``) of which file; ``--config`` may name either.
 
     :raises ConfigError: if it is neither, or a second file
     """
@@ -124,6 +159,8 @@ def _python() -> str:
 def command(argv: Sequence[str]) -> int:
     """Train; see ``--help``."""
     args = build_parser().parse_args(argv)
+    if args.tensorboard:  # told before the run's folder is made
+        require("tensorboard", extra="plots", what="--tensorboard")
     th.set_num_threads(args.num_threads)
     stop_like_ctrl_c()
     options = RunOptions(
@@ -137,7 +174,7 @@ def command(argv: Sequence[str]) -> int:
     try:
         folder, result = _run(args, options, argv)
     except Interrupted as stopped:
-        print(f"\n{stopped}; go on with: python -m sb3_tbc.train --resume {stopped.folder}", file=sys.stderr)
+        print(f"\n{stopped}; continue with: python -m sb3_tbc.train --resume {stopped.folder}", file=sys.stderr)
         return INTERRUPTED
     print(describe(result, folder))
     if args.ledger is not None:

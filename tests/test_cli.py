@@ -70,6 +70,81 @@ def test_evaluate_prints_what_it_writes(run: RunFolder, tmp_path: Path, capsys: 
     assert {k: result[k] for k in PINNED} == {k: final[k] for k in PINNED}  # a loaded agent acts as the saved one
 
 
+def test_evaluate_prints_a_summary_for_people(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(run.model), "--n-episodes", "2", "--seed", str(run.read_final()["eval_seed"])]
+    assert evaluate.main(arguments) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "agent            tbc-hrl (full), 400 training steps on Pendulum"
+    assert lines[1].startswith(f"success rate     {run.read_final()['success_rate']:.2f}  (")
+    assert "of 2 episodes; 95 % interval" in lines[1]
+    assert 4 <= len(lines) <= 6
+
+
+def test_json_to_standard_output_is_nothing_but_json(run: RunFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(run.model), "--n-episodes", "2", "--seed", str(run.read_final()["eval_seed"]), "--json", "-"]
+    assert evaluate.main(arguments) == 0
+    captured = capsys.readouterr()
+    assert {k: json.loads(captured.out)[k] for k in PINNED} == {k: run.read_final()[k] for k in PINNED}
+    assert captured.err == ""
+
+
+def test_a_folder_names_the_agent_inside(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate.main([str(run.path.parent)]) == 2
+    assert f"did you mean {run.model}?" in said(capsys)
+    assert evaluate.main([str(tmp_path)]) == 2
+    assert "there is no .zip inside it" in said(capsys)
+
+
+def test_watching_without_a_display(
+    run: RunFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert evaluate.main([str(run.model), "--n-episodes", "1", "--render"]) == 2
+    assert "--render cannot open a window" in said(capsys)
+
+
+def test_watching_shows_every_frame(run: RunFolder, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_tbc.tasks import window
+
+    shown: list[tuple[int, ...]] = []
+
+    class Recorder:
+        def __init__(self, title: str, fps: float) -> None:
+            assert title == "Pendulum, tbc-hrl"
+
+        def show(self, picture: Any) -> None:
+            shown.append(picture.shape)
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(window, "Window", Recorder)
+    assert evaluate.main([str(run.model), "--n-episodes", "1", "--render", "--json", "-"]) == 0
+    assert len(shown) > 1
+    assert set(shown) == {shown[0]}
+
+
+def test_seeds_share_no_evaluation_episode() -> None:
+    from sb3_tbc.zoo.runner import evaluation_seed, final_seed
+
+    streams = [final_seed(seed) + env for seed in range(200) for env in range(10)]
+    streams += [evaluation_seed(seed) + 1000 * k + env for seed in range(200) for k in range(200) for env in range(10)]
+    assert len(set(streams)) == len(streams)
+    assert min(streams) >= 0
+    assert max(map(final_seed, (0, 10**9))) < 2**32
+    assert final_seed(0) == 2_000_000  # as in the committed ledger
+
+
+def test_names_without_regard_to_case(capsys: pytest.CaptureFixture[str]) -> None:
+    from sb3_tbc.zoo.environments import resolve_env
+
+    assert resolve_env("pendulum") == ("Pendulum", "sb3_tbc/Pendulum-v0")
+    assert resolve_env("sb3_tbc/ur5reacher-V0") == ("UR5Reacher", "sb3_tbc/UR5Reacher-v0")
+    args = train.build_parser().parse_args(["--algo", "HiTS", "--env", "DRAWBRIDGE", "--n-timesteps", "500"])
+    spec = train.build_spec(args)
+    assert (spec.run.algo, spec.run.task) == ("hits", "Drawbridge")
+
+
 def test_evaluate_in_a_new_process(run: RunFolder, tmp_path: Path) -> None:
     out = tmp_path / "e.json"
     seed = str(run.read_final()["eval_seed"])
@@ -193,7 +268,7 @@ def test_report_fills_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     ("arguments", "message"),
     [
         (["--env", "Pendulm"], "unknown environment 'Pendulm'; did you mean 'Pendulum'?"),
-        (["--env", "sb3_tbc/UR5reacher-v0"], "did you mean 'sb3_tbc/UR5Reacher-v0'?"),
+        (["--env", "sb3_tbc/UR5reach-v0"], "did you mean 'sb3_tbc/UR5Reacher-v0'?"),
         (["--env", "no_such_module:Env-v0"], "cannot import module 'no_such_module'"),
         (["--env", "Pendulum-v1"], "is not a goal environment: its observation has no observation"),
         (["--algo", "hit"], "unknown algorithm 'hit'; did you mean 'hits'?"),

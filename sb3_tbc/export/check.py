@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import Circuit, ExportedPolicy
+from sb3_tbc.extras import require
 from sb3_tbc.tbc_hrl import TBCHRL
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
@@ -74,10 +75,7 @@ class OnnxPlayer:
     """
 
     def __init__(self, path: Path) -> None:
-        if importlib.util.find_spec("onnxruntime") is None:
-            raise ConfigError("playing an ONNX policy needs onnxruntime: pip install onnxruntime")
-        import onnxruntime
-
+        onnxruntime = require("onnxruntime", extra="export", what="--check with --format onnx")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
         self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

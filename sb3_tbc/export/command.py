@@ -3,39 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 
 from sb3_tbc.commands import Parser, positive_int, run_command
-from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import MLP, Circuit, ExportedPolicy, extract
+from sb3_tbc.extras import require
 from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.zoo.algorithms import load_two_levels
 
 SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
 
 
+EXAMPLES = {
+    "sb3_tbc.export model.zip --format c": "model.c: one file of C99 for a microcontroller",
+    "sb3_tbc.export model.zip --format onnx --check 1000": "ONNX, compared with the agent over 1000 steps",
+    "sb3_tbc.export model.zip --format numpy --output policy.py": "a Python module that needs NumPy alone",
+}
+
+
 def build_parser() -> Parser:
     """The command's arguments."""
-    parser = Parser("sb3_tbc.export", description=__doc__)
-    parser.add_argument("model", type=Path, metavar="MODEL.zip")
-    parser.add_argument("--format", choices=sorted(SUFFIXES), required=True)
-    parser.add_argument("--output", type=Path, help="by default beside the model, with the format's suffix")
-    parser.add_argument("--check", type=positive_int, metavar="STEPS", help="play this many steps beside the agent")
-    parser.add_argument("--env", help="where to play; by default the task the agent was trained on")
-    parser.add_argument("--seed", type=int, default=0, help="of the episodes played")
+    parser = Parser("sb3_tbc.export", EXAMPLES, description=__doc__)
+    parser.add_argument("model", type=Path, metavar="MODEL.zip", help="the agent; it must have two levels")
+    parser.add_argument("--format", choices=sorted(SUFFIXES), required=True, help="what to write")
+    parser.add_argument("--output", type=Path, help="file to write; by default beside the model, with another suffix")
+    parser.add_argument("--check", type=positive_int, metavar="STEPS", help="play this many steps with the agent and "
+                        "with the exported policy, and say how much their actions differ")  # fmt: skip
+    parser.add_argument("--env", help="where --check plays; by default the task the agent was trained on")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes that --check plays")
     return parser
 
 
 def write_onnx(policy: ExportedPolicy, path: Path) -> None:
     """Write the policy as an ONNX graph.
 
-    :raises ConfigError: if onnx is not installed
+    :raises MissingExtraError: if onnx is not installed
     """
-    if find_spec("onnx") is None:
-        raise ConfigError("writing ONNX needs the onnx package: pip install onnx onnxruntime")
-    import onnx
-
+    onnx = require("onnx", extra="export", what="--format onnx")
     from sb3_tbc.export.onnx_graph import to_onnx
 
     model = to_onnx(policy)
@@ -69,6 +73,8 @@ def describe(policy: ExportedPolicy) -> str:
 def command(argv: Sequence[str]) -> int:
     """Export; see ``--help``."""
     args = build_parser().parse_args(argv)
+    if args.format == "onnx":  # told before the agent is loaded
+        require("onnx", extra="export", what="--format onnx")
     model = load_two_levels(args.model)
     path = args.output or args.model.with_suffix(SUFFIXES[args.format])
     policy = extract(model, args.model.stem)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sb3_tbc.extras import require
 from sb3_tbc.ndbc.wiring import LAYERS
 
 if TYPE_CHECKING:
@@ -24,13 +25,13 @@ def draw_wiring(wiring: NDBCWiring, ax: Any = None, input_names: Sequence[str] |
     :param input_names: a name per sensory neuron
     :return: the axes
     :raises ValueError: if there are not as many names as inputs
+    :raises MissingExtraError: without matplotlib
     """
     if input_names is not None and len(input_names) != wiring.n_inputs:
         raise ValueError(f"need {wiring.n_inputs} input names, got {len(input_names)}")
     if ax is None:
-        import matplotlib.pyplot as plt
-
-        _, ax = plt.subplots(figsize=(7.0, 4.0))  # constrained layout takes minutes over so many arrows
+        pyplot = require("matplotlib.pyplot", extra="plots", what="drawing a wiring")
+        _, ax = pyplot.subplots(figsize=(7.0, 4.0))  # constrained layout takes minutes over so many arrows
     places = _places(wiring)
     sensory, neurons = places[: wiring.n_inputs], places[wiring.n_inputs :]
     for sources, signs in ((sensory, wiring.sensory), (neurons, wiring.recurrent)):

@@ -61,13 +61,25 @@ NOTES = (
 )
 
 
+EXAMPLES = {
+    "sb3_tbc.report runs": "tables of the finished runs in a folder",
+    "sb3_tbc.report results --html report.html": "one page with tables, statistics and learning curves",
+}
+
+
+def build_parser() -> Parser:
+    """The command's arguments."""
+    parser = Parser("sb3_tbc.report", EXAMPLES, description=__doc__)
+    parser.add_argument("results", nargs="?", type=Path, default=Path("results"),
+                        help="folder of runs, or the ledger; by default results")  # fmt: skip
+    parser.add_argument("--html", type=Path, metavar="OUT", help="write a page that needs no other file")
+    parser.add_argument("--update", type=Path, metavar="PAGE.md", help="put the tables between the page's result marks")
+    return parser
+
+
 def command(argv: Sequence[str]) -> int:
     """Report; see ``--help``."""
-    parser = Parser("sb3_tbc.report", description=__doc__)
-    parser.add_argument("results", nargs="?", type=Path, default=Path("results"), help="folder of runs or the ledger")
-    parser.add_argument("--html", type=Path, metavar="OUT", help="write a page; the curves also go beside it as PNG")
-    parser.add_argument("--update", type=Path, metavar="PAGE.md", help="put the tables between the page's result marks")
-    args = parser.parse_args(argv)
+    args = build_parser().parse_args(argv)
     results = load_results(args.results)
     tables = {"Success": success_table(results)}
     comparison = comparison_table(results)

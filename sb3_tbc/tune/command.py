@@ -9,7 +9,6 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +16,7 @@ import torch as th
 
 from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.extras import require
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tune.objectives import ACROSS, OBJECTIVES
 from sb3_tbc.tune.search_space import complete, load_space, restrict
@@ -45,43 +45,55 @@ DEFAULTS: dict[str, Any] = {
 }
 
 
+EXAMPLES = {
+    "sb3_tbc.tune --env Pendulum --workers 2": "30 trials of two seeds each, on two processes",
+    "sb3_tbc.tune --env Pendulum --search 'low.*' --n-timesteps 50000": "search the low level's settings, short runs",
+    "sb3_tbc.tune --env Pendulum --trial best --seed 100": "train on the best trial's settings with a fresh seed",
+}
+
+
 def build_parser() -> Parser:
     """The command's arguments."""
-    parser = Parser("sb3_tbc.tune", description=__doc__)
+    parser = Parser("sb3_tbc.tune", EXAMPLES, description=__doc__)
     add = parser.add_argument
     add("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
-    add("--env", default="Pendulum", help="a task's short name or any registered goal environment id")
-    add("--study-name", help="an existing one is resumed; by default <algo>-<task>")
-    add("--n-trials", type=positive_int, default=30, help="trials of the whole study, those done before included")
+    add("--env", default="Pendulum", help="a task's name or the id of any registered goal environment")
+    add("--study-name", help="an existing study is continued; by default <algo>-<task>")
+    add("--n-trials", type=positive_int, default=30, help="trials of the whole study, earlier ones included")
     add("--workers", type=positive_int, default=1, help="processes on this machine")
     add("--storage", help="journal file (*.log) or any Optuna URL; by default <log-folder>/<study>/journal.log")
     add("--sampler", default="tpe", help="tpe, random, or another of optuna.samplers")
-    add("--sampler-seed", type=int, default=0)
+    add("--sampler-seed", type=int, default=0, help="seed of the sampler")
     add("--pruner", default="median+wilcoxon", help="median, hyperband, halving, wilcoxon, none, or two joined by +")
-    add("--minutes", type=float, default=math.inf, help="no trial begins after so long")
-    add("--grace-seconds", type=positive_int, default=120, help="a worker silent for so long counts as dead")
+    add("--minutes", type=float, default=math.inf, help="begin no trial after this time; by default there is no limit")
+    add("--grace-seconds", type=positive_int, default=120, help="a worker that has written nothing for this many "
+        "seconds counts as dead, and its trial is started again")  # fmt: skip
     add("--log-folder", type=Path, default=Path("runs/tune"), help="runs go to <folder>/<study>/trial_<n>/seed_<s>")
-    add("--device", default="cpu")
-    add("--trial", metavar="best|N", help="train from this trial, on its settings and --seed, instead of searching")
-    add("--seed", type=int, default=0, help="with --trial: of the training")
+    add("--device", default="cpu", help="torch device")
+    add("--trial", metavar="best|N", help="do not search: train on this trial's settings with --seed")
+    add("--seed", type=int, default=0, help="with --trial: seed of the training")
     add("--overwrite", action="store_true", help="with --trial: replace an earlier run of that trial and seed")
-    same = parser.add_argument_group("what trials share; fixed when a study begins, and not needed to resume it")
+    same = parser.add_argument_group(
+        "what all trials share", "fixed when a study begins; not needed when it is continued"
+    )
     add = same.add_argument
-    add("--n-seeds", type=positive_int, help="training runs per trial (2)")
-    add("--first-seed", type=int, help="their seeds count up from here (0)")
-    add("--objective", choices=list(OBJECTIVES), help="; ".join(f"{k}: {o.text}" for k, o in OBJECTIVES.items()))
-    add("--across-seeds", choices=list(ACROSS), help="how seeds make a trial's value (mean)")
-    add("--threshold", type=float, help="success rate that steps-to-success waits for (0.9)")
+    add("--n-seeds", type=positive_int, help="training runs per trial (default: 2)")
+    add("--first-seed", type=int, help="the runs of a trial have this seed and the next ones (default: 0)")
+    add("--objective", choices=list(OBJECTIVES), help="what makes a trial good (default: auc). "
+        + "; ".join(f"{k}: {o.text}" for k, o in OBJECTIVES.items()))  # fmt: skip
+    add("--across-seeds", choices=list(ACROSS), help="how the values of the seeds become the trial's (default: mean)")
+    add("--threshold", type=float, help="success rate that the objective steps-to-success waits for (default: 0.9)")
     add("--n-timesteps", type=positive_int, help="environment steps per run; by default the task's")
-    add("--n-envs", type=positive_int, help="parallel environments per run")
-    add("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a fortieth")
-    add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (20)")
-    add("--n-final-episodes", type=positive_int, help="episodes of the evaluation after training (20)")
-    add("--config", choices=CONFIGS, help="where all that is not searched comes from; by default tuned if there is one")
-    add("--config-file", type=Path, help="another file with sections like those of zoo_configs")
-    add("--hyperparams", nargs="+", metavar="K:V", help="settings that are fixed, so not searched")
-    add("--search", nargs="+", metavar="NAME", help="search only these parameters; * and ? allowed")
-    add("--search-space", type=Path, help="file that changes ranges, see zoo_configs/search")
+    add("--n-envs", type=positive_int, help="environments side by side; by default the configuration's")
+    add("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a fortieth of a run")
+    add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (default: 20)")
+    add("--n-final-episodes", type=positive_int, help="episodes of the evaluation after training (default: 20)")
+    add("--config", choices=CONFIGS, help="values of all settings that are not searched; by default tuned where there "
+        "are such")  # fmt: skip
+    add("--config-file", type=Path, help="take them from this file, with sections like those of zoo_configs")
+    add("--hyperparams", nargs="+", metavar="NAME:VALUE", help="settings that keep this value in all trials")
+    add("--search", nargs="+", metavar="NAME", help="search only these parameters; * and ? stand for other characters")
+    add("--search-space", type=Path, help="a file that changes ranges, see zoo_configs/search")
     return parser
 
 
@@ -199,8 +211,8 @@ def open_command_study(args: argparse.Namespace) -> tuple[Study, StudySettings, 
 def command(argv: Sequence[str]) -> int:
     """Search, or train from a trial; see ``--help``."""
     args = build_parser().parse_args(argv)
-    if find_spec("optuna") is None:
-        raise ConfigError("searching needs Optuna: pip install 'sb3_tbc[tune]'")
+    require("optuna", extra="tune", what="a search")
+    args.algo = args.algo.lower()
     if not args.minutes > 0:
         raise ConfigError(f"--minutes must be above 0, got {args.minutes:g}")
     th.set_num_threads(1)
@@ -230,7 +242,7 @@ def search(args: argparse.Namespace, study: Study, settings: StudySettings, stor
     try:
         status = run_workers(job, args.workers)
     except KeyboardInterrupt:
-        print("\nstopped; the same command goes on", file=sys.stderr)
+        print("\nstopped; the same command continues", file=sys.stderr)
         status = INTERRUPTED
     summarise(study, settings, folder)
     return status

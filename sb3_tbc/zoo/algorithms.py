@@ -53,6 +53,8 @@ def read_zip(path: Path) -> dict[str, Any]:
 
     :raises ConfigError: if the file is missing, truncated, or not an agent of SB3's format
     """
+    if path.is_dir():
+        raise ConfigError(f"{path} is a folder, not an agent's .zip; {_inside(path)}")
     if not path.is_file():
         raise ConfigError(f"no such file: {path} (an agent is saved as .zip by train or model.save)")
     try:
@@ -66,6 +68,16 @@ def read_zip(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ConfigError(f"{path} is not an agent .zip: its data is no table")
     return data
+
+
+def _inside(folder: Path) -> str:
+    """What to give instead of a folder: the agent in it, where there is one."""
+    found = sorted(folder.rglob("model.zip"), key=lambda p: (p.parent.name == "checkpoint", p))
+    found = found or sorted(folder.rglob("*.zip"))
+    if not found:
+        return "there is no .zip inside it"
+    more = f" (and {len(found) - 1} more inside it)" if len(found) > 1 else ""
+    return f"did you mean {found[0]}?{more}"
 
 
 def algorithm_of(path: Path, data: dict[str, Any]) -> str:

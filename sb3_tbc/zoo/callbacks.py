@@ -181,7 +181,7 @@ class OptionTraceCallback(BaseCallback):
     """Writes every option of training to a CSV: when, where, subgoal, time budget, duration, reason of its end.
 
     :param path: the CSV file; begun anew
-    :param every: keep one option in so many, to bound the file's size
+    :param every: write every ``every``-th option only, which keeps the file small
     """
 
     def __init__(self, path: Path, every: int = 1, verbose: int = 0) -> None:

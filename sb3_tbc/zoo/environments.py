@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,8 @@ def task_names() -> dict[str, str]:
 def resolve_env(name: str) -> tuple[str, str]:
     """Task name and environment id of ``Pendulum``, ``sb3_tbc/Pendulum-v0``, any registered id, or ``module:id``.
 
+    Upper and lower case make no difference.
+
     Ids of Gymnasium-Robotics need no module: where it is installed, ``FetchReach-v4`` finds it.
 
     :return: name (of run folders and of sections in configuration files) and id, the latter with its module, so that a
@@ -39,16 +41,24 @@ def resolve_env(name: str) -> tuple[str, str]:
     :raises ConfigError: naming the nearest known one
     """
     tasks = task_names()
+    name = _as_spelt(name, tasks)
     if name in tasks:
         return name, tasks[name]
     module, _, env_id = name.rpartition(":")
     if module:
         _import(module, name)
     home = module or (home_of(env_id) if "-v" in env_id else None)
+    env_id = _as_spelt(env_id, gym.registry)
     if env_id in gym.registry:
         short = {i: task for task, i in tasks.items()}
         return short.get(env_id, env_id), f"{home}:{env_id}" if home else env_id
     raise ConfigError(f"unknown environment {name!r}; {nearest(name, _known(name, tasks))}{_hint(env_id)}")
+
+
+def _as_spelt(name: str, known: Iterable[str]) -> str:
+    """The known name that differs from ``name`` in upper and lower case at most, where there is exactly one."""
+    alike = [other for other in known if other.lower() == name.lower()]
+    return name if name in alike or len(alike) != 1 else alike[0]
 
 
 def _import(module: str, name: str) -> None:

@@ -23,9 +23,19 @@ from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise, to_json
 
-EVAL_SEED = 1_000_000
-FINAL_SEED = 2_000_000
-"""Evaluations draw from streams of their own: training seed plus these."""
+
+def evaluation_seed(seed: int) -> int:
+    """First seed of the evaluations during training.
+
+    Evaluation ``k`` adds ``1000 k``, its environment ``i`` adds ``i``. A million apart, no two training seeds share an
+    episode, and none is shared with the final evaluations. Environments take seeds below ``2**32``.
+    """
+    return (100_000_000 + 1_000_000 * seed) % 2**32
+
+
+def final_seed(seed: int) -> int:
+    """Seed of the evaluation after training; a thousand apart, no two training seeds share an episode."""
+    return (2_000_000 + 1_000 * seed) % 2**32
 
 
 @dataclass(frozen=True)
@@ -195,12 +205,12 @@ def _learn(
     setattr(model, RUN_INFO, spec.identity)
     formats = ["csv", "tensorboard"] if options.tensorboard else ["csv"]
     model.set_logger(configure(str(folder.path), formats))
-    eval_env = evaluation_envs(spec.env_id, spec.n_eval_episodes, spec.seed + EVAL_SEED, spec.run.env_kwargs)
+    eval_env = evaluation_envs(spec.env_id, spec.n_eval_episodes, evaluation_seed(spec.seed), spec.run.env_kwargs)
     evaluations = SuccessEvalCallback(
         eval_env,
         spec.eval_freq,
         spec.n_eval_episodes,
-        seed=spec.seed + EVAL_SEED,
+        seed=evaluation_seed(spec.seed),
         csv_path=folder.evaluations,
         best_model_path=folder.best_model,
         wall_time=earlier,
@@ -241,7 +251,7 @@ def _train(model: Agent, n_timesteps: int, callback: BaseCallback, progress: boo
 
 def _final(model: Agent, spec: RunSpec, folder: RunFolder, trained: float) -> dict[str, Any]:
     """Evaluate the trained agent as ``python -m sb3_tbc.evaluate`` does, on ``eval_seed``."""
-    seed = spec.seed + FINAL_SEED
+    seed = final_seed(spec.seed)
     env = evaluation_envs(spec.env_id, spec.n_final_episodes, seed, spec.run.env_kwargs)
     try:
         result = evaluate_agent(model, env, spec.n_final_episodes, seed=seed, deterministic=True)

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.extras import require
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import Agent
 from sb3_tbc.tbc_hrl.policy import TwoLevelState
@@ -75,10 +76,7 @@ def record_video(model: Agent, env: gym.Env[Any, Any], path: Path, n_episodes: i
     """
     if path.suffix != ".mp4":
         raise ConfigError(f"a video's name must end in .mp4, got {path}")
-    try:
-        import imageio.v2 as imageio
-    except ImportError as error:
-        raise ConfigError("videos need imageio: pip install 'sb3_tbc[video]'") from error
+    imageio = require("imageio.v2", extra="video", what="a film")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
     fps = env.metadata.get("render_fps", 30)

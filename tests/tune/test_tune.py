@@ -260,7 +260,7 @@ def test_a_stopped_trial_goes_back_into_the_queue(
     stopped: list[bool] = []
     seeds = quick(monkeypatch, stop_in_the_second_seed)
     assert tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY)) == 130
-    assert "the same command goes on" in capsys.readouterr().err
+    assert "the same command continues" in capsys.readouterr().err
     states = [t.state for t in load(tmp_path).trials]
     assert states == [TrialState.FAIL, TrialState.WAITING]
     assert tune.main(arguments(tmp_path, "--n-trials", "2")) == 0

@@ -1,0 +1,24 @@
+"""The minutes that ``train --list`` names, taken from the ledger."""
+
+from __future__ import annotations
+
+import numpy as np
+import yaml
+
+from sb3_tbc.report.tables import OURS, Results
+
+HEADER = "# Written by: python -m sb3_tbc.report --measured. Runs of tbc-hrl with the shipped settings in the ledger.\n"
+
+
+def measured_yaml(results: Results) -> str:
+    """Steps, mean minutes and number of our finished runs of each task, as YAML."""
+    tasks = {}
+    for task, methods in results.items():
+        runs = [run.final for run in methods.get(OURS, []) if run.final.get("wall_time")]
+        if runs:
+            tasks[task] = {
+                "steps": int(runs[0]["n_timesteps"]),
+                "minutes": round(float(np.mean([run["wall_time"] for run in runs])) / 60, 1),
+                "seeds": len(runs),
+            }
+    return HEADER + yaml.safe_dump({"tasks": tasks}, sort_keys=True)

@@ -1,0 +1,153 @@
+"""Every command through both entries, its help text, and its answer where an optional package is missing."""
+
+from __future__ import annotations
+
+import argparse
+import runpy
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+
+from sb3_tbc import __main__, evaluate, train
+from sb3_tbc.benchmark import command as benchmark
+from sb3_tbc.commands import COMMANDS, Parser
+from sb3_tbc.export import command as export
+from sb3_tbc.extras import MissingExtraError, require
+from sb3_tbc.ndbc.wiring import NDBCWiring
+from sb3_tbc.tune import command as tune
+
+RIDDLES = ("in so many", "is said too", "silent for so long", "goes on where")
+
+
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """The parser of every command and of every sub-command."""
+    found: dict[str, argparse.ArgumentParser] = {}
+    for name, command in COMMANDS.items():
+        found[name] = import_module(command.module).build_parser()
+        for action in found[name]._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                found.update({f"{name} {sub}": parser for sub, parser in action.choices.items()})
+    return found
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_through_the_console_script(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        __main__.main([name, "--help"])
+    assert stop.value.code == 0
+    assert f"usage: sb3_tbc.{name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
+def test_help_through_python_m(name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", [f"sb3_tbc.{name}", "--help"])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_module(f"sb3_tbc.{name}", run_name="__main__", alter_sys=True)
+    assert stop.value.code == 0
+    assert f"usage: sb3_tbc.{name}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_ends_with_examples_that_the_parser_takes(name: str) -> None:
+    import shlex
+
+    parser = parsers()[name]
+    lines = [line for line in parser.format_help().splitlines() if line.startswith(f"  python -m sb3_tbc.{name}")]
+    assert lines
+    for line in lines:
+        arguments = shlex.split(line.partition(" > ")[0], comments=True)[3:]
+        if "--list" not in arguments:
+            parser.parse_args(arguments)
+
+
+@pytest.mark.parametrize("name", parsers())
+def test_every_option_says_what_it_is_for(name: str) -> None:
+    for action in parsers()[name]._actions:
+        assert action.help or isinstance(action, argparse._SubParsersAction), f"{name}: {action.dest}"
+        assert not [riddle for riddle in RIDDLES if riddle in str(action.help)]
+
+
+def test_defaults_are_said_once(capsys: pytest.CaptureFixture[str]) -> None:
+    text = " ".join(train.build_parser().format_help().split())
+    assert "episodes of each evaluation (default: 20)" in text
+    assert "(default: None)" not in text
+    assert "(default: False)" not in text
+    parser = Parser("x", {"x --y": "why"})
+    parser.add_argument("--y", default=3, help="a number; by default three")
+    assert "default: 3" not in parser.format_help()
+
+
+def test_list_of_tasks(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        train.main(["--list"])
+    assert stop.value.code == 0
+    lines = capsys.readouterr().out.splitlines()
+    (pendulum,) = [line.split() for line in lines if line.startswith("  Pendulum ")]
+    assert pendulum[1] == "200,000"
+    assert float(pendulum[2]) > 0
+    (tennis,) = [line.split() for line in lines if line.startswith("  Tennis2D ")]
+    assert tennis[3] == "box2d"
+    assert [line.split()[0] for line in lines if line.startswith("  ")][-4:] == ["tbc-hrl", "hits", "hac", "sac"]
+
+
+def hide(monkeypatch: pytest.MonkeyPatch, *modules: str) -> None:
+    """Make modules impossible to import, as if their package were not installed."""
+    for module in modules:
+        for loaded in [m for m in sys.modules if m.startswith(f"{module}.")]:
+            monkeypatch.delitem(sys.modules, loaded)
+        monkeypatch.setitem(sys.modules, module, None)
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments", "module", "extra"),
+    [
+        (evaluate.main, ["missing.zip", "--video", "film.mp4"], "imageio", "video"),
+        (train.main, ["--tensorboard", "--log-folder", "runs"], "tensorboard", "plots"),
+        (tune.main, ["--n-trials", "1"], "optuna", "tune"),
+        (export.main, ["missing.zip", "--format", "onnx"], "onnx", "export"),
+        (benchmark.main, ["parameters"], "Box2D", "box2d"),
+    ],
+)
+def test_a_missing_extra_is_one_line_and_writes_nothing(
+    main: object,
+    arguments: list[str],
+    module: str,
+    extra: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    hide(monkeypatch, module)
+    assert main(arguments) == 2  # type: ignore[operator]
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert f"pip install 'sb3_tbc[{extra}]'" in said
+    assert module in said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_drawing_a_wiring_without_matplotlib(monkeypatch: pytest.MonkeyPatch) -> None:
+    hide(monkeypatch, "matplotlib")
+    wiring = NDBCWiring(
+        3, inter=4, command=3, motor=1, sensory_fanout=2, inter_fanout=2, recurrent_command_synapses=1, motor_fanin=2
+    )
+    with pytest.raises(MissingExtraError, match=r"sb3_tbc\[plots\]"):
+        wiring.draw()
+
+
+def test_require_gives_the_module_and_names_real_extras() -> None:
+    import configparser
+
+    assert require("json", extra="none", what="nothing") is sys.modules["json"]
+    parser = configparser.ConfigParser()
+    parser.read(Path(__file__).parents[1] / "setup.cfg")
+    import re
+
+    sources = (Path(__file__).parents[1] / "sb3_tbc").rglob("*.py")
+    named = {extra for source in sources for extra in re.findall(r"require\(.*?extra=\"(\w+)\"", source.read_text())}
+    assert named
+    assert named <= set(parser["options.extras_require"])
