@@ -9,14 +9,14 @@ from typing import Any
 
 import gymnasium
 
-_CLASSES = {
-    "Pendulum": "pendulum",
-    "Drawbridge": "drawbridge",
-    "UR5Reacher": "ur5_reacher",
-    "UR5ReacherBullet": "ur5_reacher_bullet",
-    "AntFourRooms": "ant_four_rooms",
-    "Platforms": "platforms",
-    "Tennis2D": "tennis2d",
+_CLASSES = {  # module, time limit
+    "Pendulum": ("pendulum", 1000),
+    "Drawbridge": ("drawbridge", 1000),
+    "UR5Reacher": ("ur5_reacher", 600),
+    "UR5ReacherBullet": ("ur5_reacher_bullet", 600),
+    "AntFourRooms": ("ant_four_rooms", 700),
+    "Platforms": ("platforms", 500),
+    "Tennis2D": ("tennis2d", 500),
 }
 TASKS = tuple(_CLASSES)
 """Names of the tasks; the id of each is ``sb3_tbc/<name>-v0``."""
@@ -32,7 +32,7 @@ def make_task(task: str, perturb: Mapping[str, Any] | None = None, **kwargs: Any
     """
     if task not in _CLASSES:
         raise ValueError(f"task must be one of {TASKS}, got {task!r}")
-    task_class = getattr(import_module(f"{__name__}.{_CLASSES[task]}"), task)
+    task_class = getattr(import_module(f"{__name__}.{_CLASSES[task][0]}"), task)
     env: gymnasium.Env[Any, Any] = task_class(**kwargs)
     if not perturb:
         return env
@@ -48,16 +48,17 @@ def make_task(task: str, perturb: Mapping[str, Any] | None = None, **kwargs: Any
 def register_tasks() -> None:
     """Register every task with Gymnasium; calling it again changes nothing.
 
-    The wrappers of ``gymnasium.make`` are left out because the tasks check actions, order of calls and time limit
-    themselves.
+    Of the wrappers that ``gymnasium.make`` adds, only the ``TimeLimit`` is kept: the tasks themselves check actions and
+    the order of calls.
     """
-    for task in TASKS:
+    for task, (_, max_episode_steps) in _CLASSES.items():
         task_id = f"sb3_tbc/{task}-v0"
         if task_id not in gymnasium.registry:
             gymnasium.register(
                 id=task_id,
                 entry_point="sb3_tbc.tasks:make_task",
                 kwargs={"task": task},
+                max_episode_steps=max_episode_steps,
                 order_enforce=False,
                 disable_env_checker=True,
             )

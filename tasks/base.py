@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import logger, spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
@@ -26,9 +27,12 @@ LAYOUTS = ("paper", "compact")
 class GoalTask(GoalEnv):  # type: ignore[misc]
     """A goal-conditioned task with a sparse reward: 0 where the goal test holds after the step, -1 elsewhere.
 
-    Success terminates an episode, the time limit (kept by the task itself) truncates it, and ``info["is_success"]``
-    is there after every step. Actions outside the action space are clipped to it; NaN, infinite and wrongly shaped
-    ones are refused. ``reset(options={"goal": ..., "state": {...}})`` puts the task into an exact start.
+    Success terminates an episode, the time limit truncates it, and ``info["is_success"]`` is there after every step.
+    A task keeps its time limit itself unless ``gymnasium.make`` built it: then the ``TimeLimit`` wrapper does, so that
+    ``gymnasium.make(id, max_episode_steps=100)`` is honoured. Actions outside the action space are clipped to it; NaN,
+    infinite and wrongly shaped ones are refused. ``reset(options={"goal": ..., "state": {...}})`` puts the task into
+    an exact start. A copy (``deepcopy``, ``pickle``), made in the middle of an episode too, is independent and goes on
+    exactly as the original does.
 
     Subclasses set the class attributes, build their physics, and implement the methods marked abstract. They take
     keyword arguments only.
@@ -41,7 +45,9 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
     max_episode_steps: int
-    """Steps after which an episode is truncated."""
+    """Steps after which an episode is truncated, unless a ``TimeLimit`` says otherwise."""
+    truncates_itself: bool = True
+    """Whether the task itself keeps the time limit; false where ``gymnasium.make`` adds a ``TimeLimit``."""
     success_terminates: bool = True
     """Whether an episode ends with success; false only where the public implementation is followed to the letter."""
     achieved_in_observation: bool = True
@@ -61,6 +67,8 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     goal_scale: Array
     """The same for ``achieved_goal`` and ``desired_goal``."""
     subgoals: SubgoalSpace
+    _not_copied: ClassVar[tuple[str, ...]] = ("_viewer",)
+    """Attributes that a copy begins without: windows, contexts, handles of engines."""
 
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
@@ -90,6 +98,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         self._tolerance = np.asarray(self.goal_tolerance, dtype=np.float64)
         self._overlay: tuple[Array | None, float | None, str | None] = (None, None, None)
         self._viewer: Any = None
+        self._spec: EnvSpec | None = None
 
     # -- what a task must give -------------------------------------------------------------------------------------
 
@@ -126,6 +135,28 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         return {}
 
     # -- Gymnasium interface ---------------------------------------------------------------------------------------
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """How ``gymnasium.make`` built the task; None where it did not."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
+        self.truncates_itself = spec is None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything but windows and handles of engines, for ``copy`` and ``pickle``."""
+        return {key: value for key, value in vars(self).items() if key not in self._not_copied}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what :meth:`__getstate__` gave and connect it with an engine again."""
+        self.__dict__.update(dict.fromkeys(self._not_copied), **state)
+        self._reconnect()
+
+    def _reconnect(self) -> None:
+        """Make what cannot be copied, and put the physics into the state that the copied attributes tell."""
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
@@ -171,7 +202,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
             {"observation": observation, "achieved_goal": np.array(achieved), "desired_goal": self._goal.copy()},
             0.0 if success else -1.0,
             terminated,
-            self._elapsed >= self.max_episode_steps and not terminated,
+            self._elapsed >= self.max_episode_steps and self.truncates_itself and not terminated,
             {"is_success": success},
         )
 
@@ -192,9 +223,9 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         return success if np.ndim(success) else bool(success)
 
     def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
-        """Whether the present step is cut by the time limit: at the limit and without success."""
+        """Whether the task itself cuts the present step: at its time limit and without success."""
         terminated = self.compute_terminated(achieved_goal, desired_goal, info)
-        at_limit = self._elapsed >= self.max_episode_steps
+        at_limit = self.truncates_itself and self._elapsed >= self.max_episode_steps
         return ~terminated & at_limit if np.ndim(terminated) else (at_limit and not terminated)
 
     def render(self) -> NDArray[np.uint8] | None:

@@ -17,6 +17,8 @@ from .history import FrameHistory
 LENGTH = 10.0
 MAX_SPEED = 0.03
 BRIDGE = 4.3
+MAX_STEPS = 1000
+"""Time limit; the observed phase counts in it, also where another limit was set."""
 N_FRAMES = 17
 FRAME_DIM = 5
 
@@ -44,7 +46,7 @@ class Drawbridge(GoalTask):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 60}
     dynamics_names = ("actuator", "bridge")
     goal_is_fixed = True
-    max_episode_steps = 1000
+    max_episode_steps = MAX_STEPS
     goal_low = (-1.0,)
     goal_high = (1.0,)
     goal_tolerance = (0.1,)
@@ -89,7 +91,7 @@ class Drawbridge(GoalTask):
 
     def _update_bridge(self, step: int) -> None:
         self._angle = -min(max(step - 500, 0) * self._bridge_speed, 90.0)
-        self._phase = 2.0 * step / self.max_episode_steps - 1.0
+        self._phase = 2.0 * step / MAX_STEPS - 1.0
 
     def _advance(self, action: list[float]) -> None:
         self._sails = min(max(self._sails + 0.03 * action[0], 0.0), 1.0)

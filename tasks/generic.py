@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
+from .time_limit import time_limit
+
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -32,7 +34,7 @@ def goal_env_problems(env: gym.Env[Any, Any], n_steps: int = 5) -> list[str]:
     problems = _space_problems(env)
     if not hasattr(env.unwrapped, "compute_reward"):
         problems.append("it has no compute_reward(achieved_goal, desired_goal, info), which relabelling goals needs")
-    if _episode_steps(env) is None:
+    if time_limit(env) is None:
         problems.append("its episodes have no time limit; pass gymnasium.make(..., max_episode_steps=N)")
     return problems or _behaviour_problems(env, n_steps)
 
@@ -139,7 +141,7 @@ def describe_goal_env(
         names=names or [f"goal_{i}" for i in range(dim)],
         groups=groups,
     )
-    steps = _episode_steps(env)
+    steps = time_limit(env)
     assert steps is not None  # checked by check_goal_env
     return GoalEnvDescription(subgoals, within, _magnitude(probe["observation"]), _magnitude(goals), steps)
 
@@ -214,12 +216,6 @@ def _described(env: gym.Env[Any, Any], given: dict[str, Any]) -> GoalEnvDescript
 
 def _fresh(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
     return env if env.spec is None else gym.make(env.spec)
-
-
-def _episode_steps(env: gym.Env[Any, Any]) -> int | None:
-    own = getattr(env.unwrapped, "max_episode_steps", None)
-    steps = env.spec.max_episode_steps if env.spec is not None and env.spec.max_episode_steps else own
-    return int(steps) if steps else None
 
 
 def _probe(env: gym.Env[Any, Any], n_steps: int, seed: int) -> dict[str, NDArray[np.float64]]:

@@ -29,20 +29,27 @@ class MujocoTask(GoalTask):
     """The same joints with what is only to be seen: shapes that collide with nothing would slow every step down."""
     frame_skip: ClassVar[int]
     dynamics_names: ClassVar[tuple[str, ...]] = ("mass", "damping", "gravity", "friction", "actuator")
+    _not_copied: ClassVar[tuple[str, ...]] = ("_viewer", "_scene", "_drawn", "model", "_qpos", "_qvel", "_ctrl")
 
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
     ) -> None:
-        self.model = mujoco.MjModel.from_xml_string(self.xml)
-        self.data = mujoco.MjData(self.model)
-        # Views into the simulator's memory stay valid for its lifetime; asking the bindings each step is slower.
-        self._qpos: Array = self.data.qpos
-        self._qvel: Array = self.data.qvel
-        self._ctrl: Array = self.data.ctrl
+        self.data = mujoco.MjData(mujoco.MjModel.from_xml_string(self.xml))
+        self._reconnect()
         self._scene: Scene | None = None
         self._title = type(self).__name__
         self._nominal = nominal_fields(self.model)
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
+
+    def _reconnect(self) -> None:
+        """Take the model and views into the simulator's memory from ``data``, whose copies bring a model of their own.
+
+        The views stay valid for the simulator's lifetime; asking the bindings each step is slower.
+        """
+        self.model: mujoco.MjModel = self.data.model
+        self._qpos: Array = self.data.qpos
+        self._qvel: Array = self.data.qvel
+        self._ctrl: Array = self.data.ctrl
 
     @abstractmethod
     def _sample_start(self) -> tuple[Array, Array]:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
-from .base import Array, GoalTask
+from .base import Array
 from .box2d import box_fixture, circle_fixture, load_box2d
 from .drawing import draw_platforms
 from .history import FrameHistory
+from .replayed import ReplayedTask
 
 DT = 1.0 / 60.0
 RADIUS = 0.05
@@ -35,7 +36,7 @@ N_FRAMES = 5
 FRAME_DIM = 15
 
 
-class Platforms(GoalTask):
+class Platforms(ReplayedTask):
     """A ball, a trigger and two platforms (dynamic RL benchmarks, Guertler et al. 2021); Box2D at 60 Hz.
 
     The action is a horizontal force of up to 0.1 N on a ball of 7.9 g. Platform 0 always moves between pit and level 1;
@@ -54,6 +55,9 @@ class Platforms(GoalTask):
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 60}
+    _not_copied: ClassVar[tuple[str, ...]] = (
+        *ReplayedTask._not_copied, "_world", "_platform0", "_platform1", "_ball",
+    )  # fmt: skip
     dynamics_names = ("mass", "gravity", "friction", "actuator")
     max_episode_steps = 500
     goal_low = (-2.0, -2.0)
@@ -63,14 +67,16 @@ class Platforms(GoalTask):
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
     ) -> None:
-        self._b2 = load_box2d()
+        self._engine = self._load_engine()
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
         self._history = FrameHistory(N_FRAMES, FRAME_DIM) if observation == "paper" else None
         self._frequency1 = 3.0 if legacy_quirks else 2.0
         self._active = False
         self._since = 0
         self._scales = dict.fromkeys(self.dynamics_names, 1.0)
-        self._build()
+        self._new_world()
+
+    _load_engine = staticmethod(load_box2d)
 
     @property
     def frame_dim(self) -> int:
@@ -94,7 +100,7 @@ class Platforms(GoalTask):
     def _build(self) -> None:
         scales = self._scales
         self._force = FORCE * scales["actuator"]
-        self._world = world = self._b2.b2World(gravity=(0, -9.8 * scales["gravity"]))
+        self._world = world = self._engine.b2World(gravity=(0, -9.8 * scales["gravity"]))
         for centre, (width, height) in STATIC:
             world.CreateStaticBody(position=centre, fixtures=box_fixture(width / 2, height / 2))
         platform = box_fixture(PLATFORM_SIZE[0] / 2, PLATFORM_SIZE[1] / 2)
@@ -110,16 +116,20 @@ class Platforms(GoalTask):
 
     def _apply_dynamics(self, scales: dict[str, float]) -> None:
         self._scales = scales
-        self._build()
+        self._new_world()
 
     def _sample_goal(self) -> Sequence[float]:
         return [-0.5 + self.np_random.uniform(-0.1, 0.1), 0.45]
 
     def _restart(self, state: dict[str, Array]) -> None:
+        if not self.legacy_quirks:
+            self._new_world()
+        self._start([])
+
+    def _begin(self, start: list[float]) -> None:
         self._active = False
         self._since = 0
         if not self.legacy_quirks:
-            self._build()
             self._move_platforms(0)
         ball = self._ball
         ball.position, ball.angle = (-0.8, -0.55), 0.0
@@ -134,7 +144,7 @@ class Platforms(GoalTask):
         speed = -self._frequency1 * AMPLITUDE * math.sin(phase) if self._active else 0.0
         self._platform1.linearVelocity = (0.0, speed)
 
-    def _advance(self, action: list[float]) -> None:
+    def _simulate(self, action: list[float]) -> None:
         ball = self._ball
         ball.ApplyForceToCenter((action[0] * self._force, 0.0), True)
         self._move_platforms(self._elapsed)

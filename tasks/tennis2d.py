@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
-from .base import Array, GoalTask
+from .base import Array
 from .box2d import load_box2d
 from .drawing import draw_tennis
+from .replayed import ReplayedTask
 from .tennis2d_world import RACKET_HALF, ROD_HALF, TennisWorld, clip_unit
 
 DT = 0.01
@@ -27,7 +28,7 @@ SECOND_BOUNCE = 3
 """Index of the flag in the observation."""
 
 
-class Tennis2D(GoalTask):
+class Tennis2D(ReplayedTask):
     """Planar tennis (dynamic RL benchmarks, Guertler et al. 2021, on the physics of roboball2d); Box2D at 100 Hz.
 
     A gun 5 m away shoots a ball at an arm of two rods and a racket. Actions (3) are joint torques as shares of 0.14,
@@ -43,10 +44,12 @@ class Tennis2D(GoalTask):
       bounce is an event: it returns control to the high level, and it alone can give hindsight goals.
 
     Mended (unless ``legacy_quirks=True``): the shot's spin never reaches the ball, which keeps the spin of the episode
-    before; solver impulses survive a reset; success does not end the episode; rounding adds a 501st step.
+    before; solver impulses survive a reset; success does not end the episode; rounding adds a 501st step (through
+    ``gymnasium.make`` only with ``max_episode_steps=501``).
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
+    _not_copied: ClassVar[tuple[str, ...]] = (*ReplayedTask._not_copied, "_arena")
     dynamics_names = ("mass", "damping", "gravity", "actuator")
     max_episode_steps = 500
     action_bound = (1.0,) * 3
@@ -57,15 +60,20 @@ class Tennis2D(GoalTask):
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
     ) -> None:
-        self._b2 = load_box2d()
+        self._engine = self._load_engine()
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
         self._scales = dict.fromkeys(self.dynamics_names, 1.0)
-        self._arena = TennisWorld(self._b2, **self._scales)
+        self._new_world()
         self._bounces = 0
         self._second = False
         if legacy_quirks:
             self.success_terminates = False
             self.max_episode_steps = 501
+
+    _load_engine = staticmethod(load_box2d)
+
+    def _build(self) -> None:
+        self._arena = TennisWorld(self._engine, **self._scales)
 
     def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
         subgoals = SubgoalSpace(
@@ -96,15 +104,18 @@ class Tennis2D(GoalTask):
     def _restart(self, state: dict[str, Array]) -> None:
         shot = state["ball_shot"].tolist() if "ball_shot" in state else self._sample_shot()
         if not self.legacy_quirks:
-            self._arena = TennisWorld(self._b2, **self._scales)
-        self._arena.restart(shot[:5], None if self.legacy_quirks else shot[5])
+            self._new_world()
+        self._start(shot)
+
+    def _begin(self, start: list[float]) -> None:
+        self._arena.restart(start[:5], None if self.legacy_quirks else start[5])
         self._bounces, self._second = 0, False
 
     def _apply_dynamics(self, scales: dict[str, float]) -> None:
         self._scales = scales
-        self._arena = TennisWorld(self._b2, **scales)
+        self._new_world()
 
-    def _advance(self, action: list[float]) -> None:
+    def _simulate(self, action: list[float]) -> None:
         arena = self._arena
         arena.step(action, DT)
         self._second = False

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
-from .base import Array, GoalTask
+from .base import Array
 from .history import FrameHistory
+from .replayed import ReplayedTask
 from .ur5_reacher import N_FRAMES, START, UR5Reacher, describe_arm, sample_arm_goal
 
 TIME_STEP = 0.002
@@ -57,7 +58,7 @@ URDF_JOINTS = (  # name, origin, rpy, axis
 )
 
 
-class UR5ReacherBullet(GoalTask):
+class UR5ReacherBullet(ReplayedTask):
     """UR5Reacher with the dynamics of PyBullet; observations, actions, goals and subgoals are the same.
 
     Links have the same shapes and inertias. The servo torque ``10 (ctrl - qd)`` and the joint damping are computed as
@@ -68,6 +69,7 @@ class UR5ReacherBullet(GoalTask):
     """
 
     metadata: ClassVar[dict[str, Any]] = UR5Reacher.metadata
+    _not_copied: ClassVar[tuple[str, ...]] = (*ReplayedTask._not_copied, "_client", "_twin")
     max_episode_steps = UR5Reacher.max_episode_steps
     action_bound = UR5Reacher.action_bound
     goal_low, goal_high = UR5Reacher.goal_low, UR5Reacher.goal_high
@@ -76,14 +78,11 @@ class UR5ReacherBullet(GoalTask):
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
     ) -> None:
-        self._bullet = load_pybullet()
+        self._engine = self._load_engine()
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
         self._history = FrameHistory(N_FRAMES, 6) if observation == "paper" else None
-        self._client: int = self._bullet.connect(self._bullet.DIRECT)
-        self._arm = -1
         self._twin: UR5Reacher | None = None
-        self._build()
-        self._pristine: int = self._bullet.saveState(physicsClientId=self._client)
+        self._new_world()
 
     @property
     def frame_dim(self) -> int:
@@ -99,10 +98,14 @@ class UR5ReacherBullet(GoalTask):
     def _state_shapes(self) -> dict[str, tuple[int, ...]]:
         return {"qpos": (3,), "qvel": (3,)}
 
+    def _load_engine(self) -> ModuleType:
+        return load_pybullet()
+
     def _build(self) -> None:
-        """Load floor and arm into an empty world."""
-        bullet, client = self._bullet, self._client
-        bullet.resetSimulation(physicsClientId=client)
+        """Load floor and arm into a world of their own."""
+        bullet = self._engine
+        self._client: int = bullet.connect(bullet.DIRECT)
+        client = self._client
         bullet.setGravity(0, 0, -9.81, physicsClientId=client)
         bullet.setPhysicsEngineParameter(
             fixedTimeStep=TIME_STEP, deterministicOverlappingPairs=1, physicsClientId=client
@@ -125,28 +128,33 @@ class UR5ReacherBullet(GoalTask):
         bullet.setJointMotorControlArray(
             self._arm, range(3), bullet.VELOCITY_CONTROL, forces=[0.0] * 3, physicsClientId=client
         )
+        self._pristine: int = bullet.saveState(physicsClientId=client)
 
     def _restart(self, state: dict[str, Array]) -> None:
-        self._bullet.restoreState(self._pristine, physicsClientId=self._client)
-        start = [self.np_random.uniform(-math.pi / 8, math.pi / 8), *START]
-        qpos, qvel = state.get("qpos", np.array(start)), state.get("qvel", np.zeros(3))
+        start = np.array([self.np_random.uniform(-math.pi / 8, math.pi / 8), *START])
+        self._record.clear()  # an episode begins from the world as it was built
+        self._start([*state.get("qpos", start), *state.get("qvel", np.zeros(3))])
+
+    def _begin(self, start: list[float]) -> None:
+        bullet, client = self._engine, self._client
+        bullet.restoreState(self._pristine, physicsClientId=client)
         for joint in range(3):
-            self._bullet.resetJointState(self._arm, joint, qpos[joint], qvel[joint], physicsClientId=self._client)
+            bullet.resetJointState(self._arm, joint, start[joint], start[3 + joint], physicsClientId=client)
         self._sub_step([0.0] * 3)
 
-    def _advance(self, action: list[float]) -> None:
+    def _simulate(self, action: list[float]) -> None:
         command = [min(max(a, -limit), limit) for a, limit in zip(action, MAX_COMMAND, strict=True)]
         for _ in range(SUB_STEPS):
             self._sub_step(command)
 
     def _joints(self) -> tuple[list[float], list[float]]:
         """Angles and velocities."""
-        states = self._bullet.getJointStates(self._arm, range(3), physicsClientId=self._client)
+        states = self._engine.getJointStates(self._arm, range(3), physicsClientId=self._client)
         return [joint[0] for joint in states], [joint[1] for joint in states]
 
     def _sub_step(self, command: list[float]) -> None:
         """Advance by 2 ms; solves ``(M + h D) a = servo - D qd - bias`` for the velocity that damping acts on."""
-        bullet, client = self._bullet, self._client
+        bullet, client = self._engine, self._client
         angles, speeds = self._joints()
         servo = [min(max(SERVO_GAIN * (u - v), -MAX_TORQUE), MAX_TORQUE) for u, v in zip(command, speeds, strict=True)]
         bias = bullet.calculateInverseDynamics(self._arm, angles, speeds, [0.0] * 3, physicsClientId=client)
@@ -188,7 +196,7 @@ class UR5ReacherBullet(GoalTask):
         if self._twin is not None:
             self._twin.close()
         if self._client >= 0:
-            self._bullet.disconnect(physicsClientId=self._client)
+            self._engine.disconnect(physicsClientId=self._client)
             self._client = -1
 
 

@@ -78,7 +78,7 @@ def test_nothing_leaks_over_reset(bullet):
 
 @pytest.mark.filterwarnings("ignore")
 def test_checker_and_bad_actions(bullet):
-    check_env(bullet, skip_render_check=True)
+    check_env(bullet.unwrapped, skip_render_check=True)
     gymnasium_check_env(gym.make("sb3_tbc/UR5ReacherBullet-v0").unwrapped, skip_render_check=True)
     bullet.reset(seed=0)
     with pytest.raises(ValueError, match="finite"):
