@@ -11,7 +11,7 @@ SEED ?= 0
 STEPS ?= $(if $(filter Pendulum,$(ENV)),100000,)
 RUN := runs/$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: help install train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks bench clean
+.PHONY: help install train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks bench pretrained clean
 
 help:
 	@echo "install          .venv with the package (editable) and what its tests need"
@@ -21,6 +21,7 @@ help:
 	@echo "type lint        mypy, ruff                  format       ruff format and fixes"
 	@echo "check-codestyle  format and lint, no change  commit-checks format type lint"
 	@echo "doc notebooks    build the pages, run the notebooks        bench  steps per second"
+	@echo "pretrained       train the agents that come with the package [TASKS=]"
 
 # The stamp is newer than the files that decide what is installed: nothing is done twice.
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
@@ -70,6 +71,9 @@ notebooks: install
 
 bench: install
 	$(BIN)/python scripts/bench.py
+
+pretrained: install
+	$(BIN)/python scripts/pretrained.py $(TASKS)
 
 clean:
 	rm -rf build dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis

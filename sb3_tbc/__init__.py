@@ -2,6 +2,7 @@
 
 from sb3_tbc import former_names
 from sb3_tbc.ndbc import NDBCNet, NDBCWiring
+from sb3_tbc.pretrained import load_pretrained
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.smdp import HierarchicalVecEnv
 from sb3_tbc.smdp.spaces import SubgoalSpace
@@ -23,6 +24,7 @@ __all__ = [
     "SubgoalSpace",
     "TBCPolicy",
     "evaluate_hierarchical",
+    "load_pretrained",
 ]
 
 former_names.install()

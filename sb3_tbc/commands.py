@@ -29,6 +29,7 @@ COMMANDS = {
     "reproduce": Command("sb3_tbc.reproduce", "run the paper's experiments, on this machine or a cluster"),
     "report": Command("sb3_tbc.report.command", "tables, statistics and learning curves of finished runs"),
     "export": Command("sb3_tbc.export.command", "write an agent as C, ONNX or NumPy code for a robot"),
+    "interpret": Command("sb3_tbc.interpret.command", "what the neurons of an agent do, and a page that shows them"),
     "benchmark": Command("sb3_tbc.benchmark.command", "measure speed beside other packages"),
 }
 """Every command by name: the console script, the tests and the docs are made from this table."""

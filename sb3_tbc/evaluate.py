@@ -13,6 +13,7 @@ from sb3_tbc.commands import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
+from sb3_tbc.pretrained import model_path
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, load_model, read_zip
 from sb3_tbc.zoo.environments import NAMESPACE, make_env, resolve_env
@@ -30,9 +31,8 @@ EXAMPLES = {
 def build_parser() -> Parser:
     """The command's arguments."""
     parser = Parser("sb3_tbc.evaluate", EXAMPLES, description=__doc__)
-    parser.add_argument(
-        "model", type=Path, metavar="MODEL.zip", help="the agent; train and model.save write such files"
-    )
+    parser.add_argument("model", type=model_path, metavar="MODEL.zip", help="the agent, as train and model.save write "
+                        "it; pretrained:TASK is one that comes with the package")  # fmt: skip
     parser.add_argument("--env", help="task or goal environment id; by default the one the agent was trained on")
     parser.add_argument("--n-episodes", type=positive_int, default=100, help="episodes to count")
     parser.add_argument("--seed", type=int, default=0, help="seed of the episodes")

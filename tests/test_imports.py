@@ -20,9 +20,10 @@ LAYERS = (
     ("level",),
     ("tbc_hrl",),
     ("zoo",),
+    ("pretrained",),
     ("train", "evaluate", "report"),
     ("tune", "export", "reproduce"),
-    ("benchmark",),
+    ("benchmark", "interpret"),
     ("__main__",),
 )
 LAYER = {name: index for index, names in enumerate(LAYERS) for name in names}

@@ -9,6 +9,7 @@ from sb3_tbc.commands import Parser, positive_int, run_command
 from sb3_tbc.export.policy import MLP, Circuit, ExportedPolicy, extract
 from sb3_tbc.extras import require
 from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.pretrained import is_pretrained, model_path
 from sb3_tbc.zoo.algorithms import load_two_levels
 
 SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
@@ -24,7 +25,9 @@ EXAMPLES = {
 def build_parser() -> Parser:
     """The command's arguments."""
     parser = Parser("sb3_tbc.export", EXAMPLES, description=__doc__)
-    parser.add_argument("model", type=Path, metavar="MODEL.zip", help="the agent; it must have two levels")
+    parser.add_argument(
+        "model", type=model_path, metavar="MODEL.zip", help="the agent, with two levels, or pretrained:TASK"
+    )
     parser.add_argument("--format", choices=sorted(SUFFIXES), required=True, help="what to write")
     parser.add_argument("--output", type=Path, help="file to write; by default beside the model, with another suffix")
     parser.add_argument("--check", type=positive_int, metavar="STEPS", help="play this many steps with the agent and "
@@ -76,7 +79,8 @@ def command(argv: Sequence[str]) -> int:
     if args.format == "onnx":  # told before the agent is loaded
         require("onnx", extra="export", what="--format onnx")
     model = load_two_levels(args.model)
-    path = args.output or args.model.with_suffix(SUFFIXES[args.format])
+    name = args.model.with_suffix(SUFFIXES[args.format])
+    path = args.output or (Path(name.name) if is_pretrained(args.model) else name)  # never into the package
     policy = extract(model, args.model.stem)
     WRITERS[args.format](policy, path)
     print(f"{describe(policy)}\nwritten: {path}")

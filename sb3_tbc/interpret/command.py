@@ -1,0 +1,98 @@
+"""``python -m sb3_tbc.interpret``: what the neurons of an agent do, with controls, and a page that shows them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch as th
+
+from sb3_tbc.commands import Parser, positive_int, run_command
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.evaluate import identify
+from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.interpret.episodes import FIRST_SEED, HeldOutEpisodes
+from sb3_tbc.interpret.features import space_of
+from sb3_tbc.interpret.findings import Effort, Findings, investigate, to_plain
+from sb3_tbc.interpret.picture import activation_in_space, units_shown
+from sb3_tbc.interpret.text import describe
+from sb3_tbc.interpret.units import units_of
+from sb3_tbc.pretrained import model_path
+from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.zoo.algorithms import load_two_levels
+from sb3_tbc.zoo.ledger import to_json
+
+EXAMPLES = {
+    "sb3_tbc.interpret pretrained:Pendulum": "all measures, on 20 held-out episodes",
+    "sb3_tbc.interpret model.zip --json inside.json --png inside.png": "every figure, and activation in space",
+    "sb3_tbc.interpret model.zip --n-episodes 100 --synapses": "narrower intervals, and every synapse cut",
+}
+MOST_IN_PICTURE = 8
+"""Episodes in the picture; more would cover each other."""
+
+
+def build_parser() -> Parser:
+    """The command's arguments."""
+    parser = Parser("sb3_tbc.interpret", EXAMPLES, description=__doc__)
+    parser.add_argument("model", type=model_path, metavar="MODEL.zip", help="the agent, with two levels, or "
+                        "pretrained:TASK")  # fmt: skip
+    parser.add_argument("--env", help="task or goal environment id; by default the one the agent was trained on")
+    parser.add_argument("--n-episodes", type=positive_int, default=20, help="held-out episodes")
+    parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first episode")
+    parser.add_argument("--json", type=Path, metavar="OUT.json", help="write every figure")
+    parser.add_argument("--png", type=Path, metavar="OUT.png", help="draw activation in space, as the paper's figure 5")
+    parser.add_argument("--n-random", type=positive_int, default=5, help="random lesions of each size")
+    parser.add_argument("--max-alone", type=positive_int, default=24, help="units lesioned one by one, the most "
+                        "active ones first")  # fmt: skip
+    parser.add_argument("--synapses", action="store_true", help="cut every synapse, too, one at a time: slow")
+    parser.add_argument("--device", default="cpu", help="torch device")
+    parser.add_argument("--num-threads", type=positive_int, default=1, help="torch threads")
+    return parser
+
+
+def command(argv: Sequence[str]) -> int:
+    """Interpret; see ``--help``."""
+    args = build_parser().parse_args(argv)
+    th.set_num_threads(args.num_threads)
+    info = identify(args.model, args.env)
+    model = load_two_levels(args.model, device=args.device)
+    units, space = units_of(model), space_of(info["task"], model.layout.subgoals)
+    if args.synapses and not hasattr(units, "synapses"):
+        raise ConfigError("--synapses cuts the synapses of a circuit; this agent's low level is an MLP")
+    episodes = HeldOutEpisodes(model, info["env_id"], info["env_kwargs"], args.n_episodes, args.seed)
+    try:
+        effort = Effort(args.n_random, args.max_alone, args.synapses)
+        found = investigate(model, units, space, info["task"], episodes, effort)
+    finally:
+        episodes.close()
+    print(describe(found), end="")
+    identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}
+    plain = to_plain(found, {**identity, "n_timesteps": int(model.num_timesteps), "first_episode_seed": args.seed})
+    if args.json is not None:
+        write_atomic(args.json, to_json(plain))
+    _draw(args, found, model, info, plain)
+    return 0
+
+
+def _draw(args: Any, found: Findings, model: TBCHRL, info: dict[str, Any], plain: dict[str, Any]) -> None:
+    """Write the picture and the page that were asked for."""
+    if args.png is None:
+        return
+    space, subgoals = space_of(info["task"], model.layout.subgoals), model.layout.subgoals
+    which = units_shown(found.units, found.activity)
+    layer = "command neurons" if found.kind == "circuit" else "units of the last hidden layer"
+    title = f"{found.task}: potential of {layer} along the trajectory"
+    picture = activation_in_space(found.traces[:MOST_IN_PICTURE], found.units, which, space, subgoals, title)
+    if args.png is not None:
+        save_atomic(lambda path: Path(path).write_bytes(picture), args.png)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point."""
+    return run_command(command, "sb3_tbc.interpret", argv)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

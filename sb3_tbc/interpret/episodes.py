@@ -1,0 +1,153 @@
+"""Held-out episodes of an agent, whole or lesioned: what every unit did at every step, and how each episode ended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tbc.interpret.units import FloatArray, Lesion, Units, stack
+from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
+from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal
+from sb3_tbc.smdp.options import Episode
+from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.collection import forget
+from sb3_tbc.zoo.environments import make_env
+
+FIRST_SEED = 50_000_000
+"""Of the first held-out episode; runs seed training and evaluations far below it."""
+MAX_SIDE_BY_SIDE = 160
+"""Environments that step together: acting costs about the same for one as for many."""
+
+
+class Trace(NamedTuple):
+    """One episode of T steps with N units."""
+
+    episode: Episode
+    inputs: FloatArray  # (T, inputs), what the low level saw
+    before: FloatArray  # (T, state_dim), its memory before each step
+    activations: FloatArray  # (T, N), after each step
+
+    @property
+    def windows(self) -> list[slice]:
+        """The steps of each option."""
+        return [slice(o.start, o.start + o.duration) for o in self.episode.options]
+
+    @property
+    def phase(self) -> FloatArray:
+        """How far each step's window has run, 0 at its first step, below 1 at its last, ``(T,)``."""
+        return np.concatenate([np.arange(o.duration) / o.duration for o in self.episode.options])
+
+    @property
+    def subgoal(self) -> FloatArray:
+        """The live subgoal of each step, ``(T, subgoal_dim)``, task units."""
+        return np.concatenate([np.tile(o.subgoal, (o.duration, 1)) for o in self.episode.options])
+
+    @property
+    def steps_left(self) -> FloatArray:
+        """Steps left of the time budget before each step, ``(T,)``."""
+        return np.concatenate([o.time_budget - np.arange(o.duration) for o in self.episode.options])
+
+
+class Outcome(NamedTuple):
+    """How episodes ended, one entry per episode."""
+
+    success: FloatArray  # 0 or 1
+    subgoals: FloatArray  # share of windows that reached their subgoal
+    length: FloatArray  # steps
+
+
+class HeldOutEpisodes:
+    """Episodes that training never saw: the same starts and goals for every lesion.
+
+    :param model: the agent, deterministic
+    :param env_id: its environment
+    :param env_kwargs: arguments of the environment
+    :param n_episodes: how many
+    :param seed: episode i starts from ``seed + i``
+    """
+
+    def __init__(
+        self, model: TBCHRL, env_id: str, env_kwargs: dict[str, Any], n_episodes: int, seed: int = FIRST_SEED
+    ) -> None:
+        self.model, self.n_episodes, self.seed = model, n_episodes, seed
+        self._make = partial(make_env, env_id, **env_kwargs)
+        self._venvs: dict[int, _SeededVecEnv] = {}
+
+    def record(self, units: Units, lesion: Lesion) -> list[Trace]:
+        """Every episode under one lesion, with all that the units did."""
+        return self._run(units, [lesion] * self.n_episodes, list(range(self.n_episodes)))
+
+    def outcomes(self, units: Units, lesions: Sequence[Lesion]) -> list[Outcome]:
+        """How all episodes end under each of several lesions."""
+        rows = [(lesion, i) for lesion in lesions for i in range(self.n_episodes)]
+        episodes: list[Episode] = []
+        for start in range(0, len(rows), MAX_SIDE_BY_SIDE):
+            chunk = rows[start : start + MAX_SIDE_BY_SIDE]
+            traces = self._run(units, [lesion for lesion, _ in chunk], [i for _, i in chunk])
+            episodes += [trace.episode for trace in traces]
+        n = self.n_episodes
+        return [outcome_of(episodes[k : k + n]) for k in range(0, len(episodes), n)]
+
+    def _run(self, units: Units, lesions: Sequence[Lesion], which: Sequence[int]) -> list[Trace]:
+        if len(which) not in self._venvs:
+            self._venvs[len(which)] = _SeededVecEnv([self._make] * len(which))
+        venv = self._venvs[len(which)]
+        venv.start_from([self.seed + i for i in which])
+        return run_once(self.model, units, venv, stack(lesions))
+
+    def close(self) -> None:
+        """Free the environments."""
+        for venv in self._venvs.values():
+            venv.close()
+
+
+def outcome_of(episodes: Sequence[Episode]) -> Outcome:
+    """How episodes ended."""
+    return Outcome(
+        np.array([float(e.success) for e in episodes]),
+        np.array([np.mean([o.reached for o in e.options]) for e in episodes]),
+        np.array([float(e.length) for e in episodes]),
+    )
+
+
+def run_once(model: TBCHRL, units: Units, venv: VecEnv, lesion: Lesion) -> list[Trace]:
+    """One whole episode in every environment.
+
+    :param lesion: one row per environment
+    """
+    rng = np.random.default_rng(0)  # both levels act by their means and draw nothing
+
+    def propose(observations: FloatArray, where: NDArray[np.intp]) -> Proposal:
+        no_state = np.zeros((len(where), 0), dtype=np.float32)
+        unit, _ = model.high.act(observations, no_state, True, rng, average=True)
+        return Proposal(unit.astype(np.float64), np.zeros(len(where), dtype=bool))
+
+    env = HierarchicalVecEnv(venv, propose, model.layout, model.rules, schedule=model.schedule)
+    inputs = env.reset()
+    memory = np.zeros((env.num_envs, units.state_dim), dtype=np.float32)
+    log: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    finished: dict[int, Episode] = {}
+    while len(finished) < env.num_envs:
+        unit, after, activations = units.step(inputs, memory, lesion)
+        log.append((inputs, memory, activations.astype(np.float32)))
+        seen, _, window_over, infos = env.step(model.policy._unscale(unit))
+        inputs, memory = np.asarray(seen), forget(after, model.memory, window_over, infos)
+        over = [index for index in range(env.num_envs) if infos[index].get("episode_over")]
+        for index, episode in zip(over, env.episodes, strict=True):
+            finished.setdefault(index, episode)
+        env.episodes = []
+    columns = [np.stack(part) for part in zip(*log, strict=True)]
+    return [Trace(e, *(part[: e.length, i] for part in columns)) for i, e in sorted(finished.items())]
+
+
+class _SeededVecEnv(GoalVecEnv):
+    """Goal environments whose next episodes start from given seeds, which may repeat."""
+
+    def start_from(self, seeds: Sequence[int]) -> None:
+        """Give every environment the seed of its next reset."""
+        self._seeds = list(seeds)
