@@ -14,7 +14,7 @@ PACKAGE = ROOT / "sb3_tbc"
 
 # From bottom to top: a folder (or a module beside the folders) imports from itself and from lower layers alone.
 LAYERS = (
-    ("former_names", "errors", "stats", "files"),
+    ("former_names", "errors", "stats", "files", "arrays"),
     ("commands", "extras", "smdp"),
     ("replay", "ndbc", "tasks", "zoo_configs"),
     ("level",),
@@ -29,7 +29,10 @@ LAYERS = (
 LAYER = {name: index for index, names in enumerate(LAYERS) for name in names}
 
 TASK_PACKAGES = {"gymnasium", "gymnasium_robotics", "numpy", "mujoco", "Box2D", "pybullet", "tkinter", "pygame"}
+GIVEN_TO_TASKS = ("sb3_tbc.smdp.spaces", "sb3_tbc.smdp.goal_spaces", "sb3_tbc.smdp.goal_test", "sb3_tbc.errors")
 NO_TORCH = (
+    "sb3_tbc.arrays",
+    "sb3_tbc.smdp.goal_spaces",
     "sb3_tbc.tasks",
     "sb3_tbc.smdp.spaces",
     "sb3_tbc.errors",
@@ -107,9 +110,7 @@ def test_tasks_need_gymnasium_numpy_and_spaces_only(name: str) -> None:
     for imported in imports(name, everywhere=True):
         top = imported.split(".")[0]
         if top == "sb3_tbc":
-            assert imported.startswith(("sb3_tbc.tasks", "sb3_tbc.smdp.spaces", "sb3_tbc.errors")), (
-                f"{name}: {imported}"
-            )
+            assert imported.startswith(("sb3_tbc.tasks", *GIVEN_TO_TASKS)), f"{name}: {imported}"
         else:
             assert top in TASK_PACKAGES | set(sys.stdlib_module_names), f"{name} must not import {imported}"
 

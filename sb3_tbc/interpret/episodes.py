@@ -7,15 +7,14 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.interpret.units import FloatArray, Lesion, Units, stack
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
-from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 from sb3_tbc.smdp.options import Episode
+from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.tbc_hrl import TBCHRL
-from sb3_tbc.tbc_hrl.collection import forget
+from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.zoo.environments import make_env
 
 FIRST_SEED = 50_000_000
@@ -120,29 +119,34 @@ def run_once(model: TBCHRL, units: Units, venv: VecEnv, lesion: Lesion) -> list[
 
     :param lesion: one row per environment
     """
-    rng = np.random.default_rng(0)  # both levels act by their means and draw nothing
-
-    def propose(observations: FloatArray, where: NDArray[np.intp]) -> Proposal:
-        no_state = np.zeros((len(where), 0), dtype=np.float32)
-        unit, _ = model.high.act(observations, no_state, True, rng, average=True)
-        return Proposal(unit.astype(np.float64), np.zeros(len(where), dtype=bool))
-
-    env = HierarchicalVecEnv(venv, propose, model.layout, model.rules, schedule=model.schedule)
-    inputs = env.reset()
-    memory = np.zeros((env.num_envs, units.state_dim), dtype=np.float32)
-    log: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+    runner = _LesionedRunner(model, units, venv, lesion)
+    runner.reset()
     finished: dict[int, Episode] = {}
-    while len(finished) < env.num_envs:
-        unit, after, activations = units.step(inputs, memory, lesion)
-        log.append((inputs, memory, activations.astype(np.float32)))
-        seen, _, window_over, infos = env.step(model.policy._unscale(unit))
-        inputs, memory = np.asarray(seen), forget(after, model.memory, window_over, infos)
-        over = [index for index in range(env.num_envs) if infos[index].get("episode_over")]
-        for index, episode in zip(over, env.episodes, strict=True):
-            finished.setdefault(index, episode)
-        env.episodes = []
-    columns = [np.stack(part) for part in zip(*log, strict=True)]
+    while len(finished) < venv.num_envs:
+        finished = runner.step().episodes | finished  # of each environment the first
+    columns = [np.stack(part) for part in zip(*runner.log, strict=True)]
     return [Trace(e, *(part[: e.length, i] for part in columns)) for i, e in sorted(finished.items())]
+
+
+class _LesionedRunner(TwoLevelRunner):
+    """The deterministic agent with a lesioned low level, all of whose units are recorded."""
+
+    def __init__(self, model: TBCHRL, units: Units, venv: VecEnv, lesion: Lesion) -> None:
+        rng = np.random.default_rng(0)  # both levels act by their means and draw nothing
+        super().__init__(venv, model.actor, model.layout, model.rules, rng, model.schedule, deterministic=True)
+        self.units, self.lesion = units, lesion
+        self.log: list[tuple[FloatArray, FloatArray, FloatArray]] = []
+
+    def begin(self, observation: GoalObservation) -> None:
+        """Begin episodes; units may have other memory than the trained low level."""
+        super().begin(observation)
+        self.membrane = np.zeros((self.env.num_envs, self.units.state_dim), dtype=np.float32)
+
+    def act(self) -> tuple[FloatArray, FloatArray]:
+        """Act with the lesion, and record."""
+        unit, after, activations = self.units.step(self.observation, self.membrane, self.lesion)
+        self.log.append((self.observation, self.membrane, activations.astype(np.float32)))
+        return unit, after
 
 
 class _SeededVecEnv(GoalVecEnv):

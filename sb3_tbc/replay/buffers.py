@@ -17,7 +17,7 @@ from sb3_tbc.smdp.hindsight import HighLevelSteps, LowLevelSteps, ordered_pairs
 from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.smdp.rewards import LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
-from sb3_tbc.smdp.views import LevelLayout
+from sb3_tbc.smdp.views import LevelViews
 
 Teacher = Callable[[Float32, Float32, Float32], Float32]
 """Maps high-level observations, local states and subgoal-space points to unit time budgets to imitate, ``(n,)``."""
@@ -130,7 +130,7 @@ class SubgoalReplayBuffer(RingBuffer):
         buffer_size: int,
         observation_space: spaces.Box,
         action_space: spaces.Box,
-        layout: LevelLayout,
+        layout: LevelViews,
         rules: OptionRules,
         state_dim: int,
         gamma: float,

@@ -11,25 +11,40 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.errors import HierarchyError
-from sb3_tbc.smdp.options import Episode, OptionClock, OptionRules
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, width
+from sb3_tbc.smdp.options import Episode, OptionClock, OptionRules, TerminationReason
 from sb3_tbc.smdp.recorder import EpisodeRecorder
-from sb3_tbc.smdp.spaces import FloatArray, GoalObservation
-from sb3_tbc.smdp.views import GOAL_KEYS, LevelLayout, check_goal_space, width
+from sb3_tbc.smdp.spaces import GoalObservation
+from sb3_tbc.smdp.views import LevelViews
 
 
 class Proposal(NamedTuple):
     """What the high level answers when asked for options: one row per environment that needs one."""
 
     unit_actions: FloatArray  # (n, subgoal_dim + 1) in [-1, 1]: subgoal, then time budget unless a schedule gives it
-    testing: NDArray[np.bool_]  # (n,), whether the option is a subgoal test
+    testing: BoolArray  # (n,), whether the option is a subgoal test
 
 
-HighLevel = Callable[[FloatArray, NDArray[np.intp]], Proposal]
+HighLevel = Callable[[FloatArray, Indices], Proposal]
 """Maps high-level observations ``(n, high_dim)`` of the environments ``(n,)`` to their next options."""
 
 Schedule = Callable[[FloatArray, GoalObservation], FloatArray]
 """Appends unit time budgets to unit subgoals ``(n, subgoal_dim)`` chosen at goal observations."""
+
+
+class HierarchicalStep(NamedTuple):
+    """What one step of every environment led to."""
+
+    observations: FloatArray  # (n_envs, low_dim), the low level's, of the next options where windows ended
+    window_over: BoolArray  # (n_envs,)
+    task_observations: GoalObservation  # the task's, after automatic resets
+    task_rewards: FloatArray  # (n_envs,), the task's
+    episode_over: BoolArray  # (n_envs,)
+    infos: list[dict[str, Any]]  # the task's; "option" where a window ended
+    rewards: FloatArray  # (n_envs,), the low level's: 1 where a window ended with its subgoal reached
+    episodes: dict[int, Episode]  # those that ended, by environment
 
 
 class HierarchicalVecEnv(VecEnvWrapper):
@@ -37,11 +52,12 @@ class HierarchicalVecEnv(VecEnvWrapper):
 
     An observation is ``(local state, subgoal, remaining time)``, a reward is 1 when a window ends with its subgoal
     reached and else 0, and a done flag is the end of a *window*. When windows end, the high level is asked for the
-    next options of just those environments; the others do not wait. Finished episodes wait in :attr:`episodes`.
+    next options of just those environments; the others do not wait. :meth:`advance` also tells what both levels learn
+    from: whole episodes. For SB3's algorithms it is an ordinary ``VecEnv``, see :meth:`step_wait`.
 
     :param venv: goal environments; automatic resets as in SB3
     :param high_level: proposes options; may be set later through the attribute of the same name
-    :param layout: how the levels' observations are put together
+    :param layout: what each level sees
     :param rules: what ends an option
     :param state_dim: width of the low level's memory to record with each step
     :param schedule: gives the time budgets where the high level does not
@@ -52,50 +68,47 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self,
         venv: VecEnv,
         high_level: HighLevel | None,
-        layout: LevelLayout,
+        layout: LevelViews,
         rules: OptionRules,
         state_dim: int = 0,
         schedule: Schedule | None = None,
     ) -> None:
-        space = check_goal_space(venv.observation_space)
+        space = check_goal_space(venv.observation_space, venv.action_space)
         super().__init__(venv, observation_space=layout.low_space(), action_space=venv.action_space)
-        self.high_level = high_level
-        self.layout = layout
-        self.rules = rules
-        self.schedule = schedule
-        self.clock = OptionClock(venv.num_envs, layout.subgoals.dim, rules)
-        self.episodes: list[Episode] = []
+        self.high_level, self.views, self.rules, self.schedule = high_level, layout, rules, schedule
+        self.clock = OptionClock(venv.num_envs, layout.subgoals, rules)
+        self.unit: Any = UnitActions(self.action_space)  # type: ignore[arg-type]
         self._everywhere = np.arange(venv.num_envs)
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
-        self._memory = (self._no_memory, self._no_memory)
         self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
-        low, high = self.action_space.low, self.action_space.high  # type: ignore[attr-defined]
-        self._centre, self._half = 0.5 * (low + high), 0.5 * (high - low)
         self._started = False
+        self._given: NDArray[Any] = np.zeros(0)  # what step_async was given
 
     def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
         sizes = {key: width(space, key) for key in GOAL_KEYS}
-        actions = self.action_space.shape
-        if not isinstance(self.action_space, spaces.Box) or actions is None or len(actions) != 1:
-            raise ValueError(
-                f"a hierarchical agent needs a Box action space with one dimension, got {self.action_space}"
-            )
         return {
             **sizes,
-            "actions": actions[0],
+            "actions": self.action_space.shape[0],  # type: ignore[index]
             "states": state_dim,
             "next_states": state_dim,
         }
 
     def reset(self) -> FloatArray:
         """Reset every environment and ask for its first option."""
-        observation: GoalObservation = self.venv.reset()  # type: ignore[assignment]
+        return self.begin(self.venv.reset())  # type: ignore[arg-type]
+
+    def begin(self, observation: GoalObservation) -> FloatArray:
+        """Ask for the first options of environments that were just reset.
+
+        :param observation: what the environments show
+        :return: what the low level sees
+        """
         self._begin_episodes(self._everywhere, observation)
         self._begin_options(self._everywhere, observation)
         self._started = True
         return self._low_observation(observation)
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> Arrays:
         """Live options and running episodes, as plain arrays; the environments themselves are not among them."""
         recorded = {f"recorder.{name}": array for name, array in self._recorder.get_state().items()}
         return {**recorded, **{f"clock.{name}": getattr(self.clock, name).copy() for name in self.clock.fields}}
@@ -111,45 +124,66 @@ class HierarchicalVecEnv(VecEnvWrapper):
         for (owner, _, name), array in parts.items():
             if owner == "clock":
                 getattr(self.clock, name)[:] = array
-        self.episodes = []
         self._started = True
         return self._low_observation(observation)
 
-    def remember(self, states: FloatArray, next_states: FloatArray) -> None:
-        """Membrane potentials before and after the coming step, ``(n_envs, state_dim)``, to be recorded with it."""
-        self._memory = (states, next_states)
+    def advance(
+        self, unit_actions: FloatArray, states: FloatArray | None = None, next_states: FloatArray | None = None
+    ) -> HierarchicalStep:
+        """Advance every environment by one step; close and replace the options that end with it.
 
-    def unscale(self, unit_actions: FloatArray) -> FloatArray:
-        """The environments' actions for unit ones."""
-        actions: FloatArray = self._centre + self._half * unit_actions
-        return actions
-
-    def step_async(self, actions: NDArray[Any]) -> None:
-        """Step with actions in the environment's units.
-
+        :param unit_actions: ``(n_envs, action_dim)`` in [-1, 1]
+        :param states: the low level's memory before the step, ``(n_envs, state_dim)``, to be recorded with it
+        :param next_states: and after it
         :raises HierarchyError: before the first reset
         """
-        if not self._started:
-            raise HierarchyError("HierarchicalVecEnv.step was called before reset")
-        self._recorder.before_step((actions - self._centre) / self._half, *self._memory)
-        self.venv.step_async(actions)
+        return self._advance(self.unit.unscale(unit_actions), unit_actions, states, next_states)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Step with actions in the environment's units, as SB3 does it."""
+        self._given = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Advance every environment by one step; close and replace the options that end with it."""
-        observation, rewards, dones, infos = self.venv.step_wait()
+        """The low level's problem in SB3's form, for any algorithm.
+
+        ``info["terminal_observation"]`` is what the low level saw at the end of a window, and
+        ``info["TimeLimit.truncated"]`` says that the window was cut off, so that its end is not the problem's.
+        """
+        step = self._advance(self._given, self.unit.scale(self._given), None, None, for_low_level=True)
+        return step.observations, step.rewards, step.window_over, step.infos
+
+    def _advance(
+        self,
+        actions: NDArray[Any],
+        unit: FloatArray,
+        states: FloatArray | None,
+        next_states: FloatArray | None,
+        for_low_level: bool = False,
+    ) -> HierarchicalStep:
+        if not self._started:
+            raise HierarchyError("HierarchicalVecEnv.step was called before reset")
+        no_memory = self._no_memory
+        self._recorder.before_step(
+            unit, no_memory if states is None else states, no_memory if next_states is None else next_states
+        )
+        observation, task_rewards, dones, infos = self.venv.step(actions)
         seen = self._before_reset(observation, dones, infos)  # type: ignore[arg-type]
-        self._recorder.after_step(rewards, seen)
+        self._recorder.after_step(task_rewards, seen)
         self.clock.tick()
-        reached, ended = self._window_ends(seen, dones)
-        low_rewards = np.zeros(self.num_envs, dtype=np.float32)
-        if np.count_nonzero(ended):  # several times as fast as any() on so few
-            where = np.flatnonzero(ended)
-            low_rewards[where] = self._close_options(where, seen, reached, dones, infos)
-            self._next_options(where, observation, dones, infos)  # type: ignore[arg-type]
-        return self._low_observation(observation), low_rewards, ended, infos  # type: ignore[arg-type]
+        over = self.clock.ended(seen) | dones
+        rewards, episodes = np.zeros(self.num_envs, dtype=np.float32), {}
+        if np.count_nonzero(over):  # several times as fast as any() on so few
+            where = np.flatnonzero(over)
+            rewards[where] = self._close_options(where, seen, dones, infos)
+            last = self._low_observation(seen) if for_low_level else None
+            episodes = self._next_options(where, observation, dones, infos)  # type: ignore[arg-type]
+            if last is not None:
+                _tell_low_level(where, last, infos)
+        low = self._low_observation(observation)  # type: ignore[arg-type]
+        return HierarchicalStep(low, over, observation, task_rewards, dones, infos, rewards, episodes)  # type: ignore[arg-type]
 
     def _before_reset(
-        self, observation: GoalObservation, dones: NDArray[np.bool_], infos: list[dict[str, Any]]
+        self, observation: GoalObservation, dones: BoolArray, infos: list[dict[str, Any]]
     ) -> GoalObservation:
         """What the step led to: SB3 hides the last observation of an episode in ``info``."""
         if not np.count_nonzero(dones):
@@ -160,65 +194,39 @@ class HierarchicalVecEnv(VecEnvWrapper):
                 seen[key][index] = infos[index]["terminal_observation"][key]
         return seen
 
-    def _window_ends(
-        self, seen: GoalObservation, dones: NDArray[np.bool_]
-    ) -> tuple[NDArray[np.bool_] | None, NDArray[np.bool_]]:
-        """Which subgoals are reached (``None``: not looked at, no window can end by it) and which windows end."""
-        ended = self.clock.expired | dones
-        if self.layout.subgoals.event is not None:
-            ended |= self.layout.subgoals.happened(seen)
-        if self.rules.window_end == "timed":
-            return None, ended
-        reached = self.layout.subgoals.reached(self.layout.subgoals.achieved(seen), self.clock.subgoal)
-        early = reached & (self.clock.elapsed >= self.rules.dt_min)
-        return reached, ended | early
-
     def _close_options(
-        self,
-        where: NDArray[np.intp],
-        seen: GoalObservation,
-        reached: NDArray[np.bool_] | None,
-        dones: NDArray[np.bool_],
-        infos: list[dict[str, Any]],
+        self, where: Indices, seen: GoalObservation, dones: BoolArray, infos: list[dict[str, Any]]
     ) -> FloatArray:
         """Record the options that end; the low level's reward of each."""
-        subgoals, here = self.layout.subgoals, {key: seen[key][where] for key in GOAL_KEYS}
-        if reached is None:
-            reached_here = subgoals.reached(subgoals.achieved(here), self.clock.subgoal[where])
-        else:
-            reached_here = reached[where]
-        event = subgoals.happened(here)
+        here = {key: seen[key][where] for key in GOAL_KEYS}
+        reached = self.clock.reached(here, where)
         rewards = np.zeros(len(where), dtype=np.float32)
         for row, index in enumerate(where):
             step = int(self._recorder.steps[index])
-            option = self.clock.close(index, step, bool(reached_here[row]), bool(dones[index]), bool(event[row]))
+            option = self.clock.close(index, step, bool(reached[row]), bool(dones[index]))
             self._recorder.options[index].append(option)
             infos[index]["option"] = option.as_info()
             rewards[row] = float(option.reached)
         return rewards
 
     def _next_options(
-        self,
-        where: NDArray[np.intp],
-        observation: dict[str, FloatArray],
-        dones: NDArray[np.bool_],
-        infos: list[dict[str, Any]],
-    ) -> None:
+        self, where: Indices, observation: dict[str, FloatArray], dones: BoolArray, infos: list[dict[str, Any]]
+    ) -> dict[int, Episode]:
         """Finish episodes and begin options; enforced resets change ``observation`` in place."""
         over = where[dones[where] | (self.clock.used[where] >= self.rules.max_options)]
-        for index in over:
-            self._finish_episode(index, observation, bool(dones[index]), infos[index])
+        episodes = {int(i): self._finish_episode(i, observation, bool(dones[i]), infos[i]) for i in over}
         if len(over):
             self._begin_episodes(over, {key: observation[key][over] for key in GOAL_KEYS})
+            dones[over] = True
         self._begin_options(where, observation)
+        return episodes
 
-    def _finish_episode(self, index: int, observation: dict[str, FloatArray], done: bool, info: dict[str, Any]) -> None:
+    def _finish_episode(
+        self, index: int, observation: dict[str, FloatArray], done: bool, info: dict[str, Any]
+    ) -> Episode:
         truncated = bool(info.get("TimeLimit.truncated", False)) or not done
         success = bool(info.get("is_success", False)) and done
-        episode = self._recorder.finish(index, terminated=not truncated, success=success)
-        self.episodes.append(episode)
-        info["episode_over"] = True
-        info["budget_exhausted"] = not done
+        episode = self._recorder.finish(index, not truncated, success, budget_exhausted=not done)
         if not done:  # the environment itself would go on: end the episode for it
             info["terminal_observation"] = {key: np.array(observation[key][index]) for key in GOAL_KEYS}
             info["TimeLimit.truncated"] = True
@@ -226,19 +234,30 @@ class HierarchicalVecEnv(VecEnvWrapper):
             fresh, _ = self.venv.env_method("reset", indices=[int(index)])[0]
             for key in GOAL_KEYS:
                 observation[key][index] = fresh[key]
+        return episode
 
-    def _begin_episodes(self, where: NDArray[np.intp], observation: GoalObservation) -> None:
+    def _begin_episodes(self, where: Indices, observation: GoalObservation) -> None:
         self.clock.begin_episode(where)
         self._recorder.begin(where, observation)
 
-    def _begin_options(self, where: NDArray[np.intp], observation: GoalObservation) -> None:
+    def _begin_options(self, where: Indices, observation: GoalObservation) -> None:
         if self.high_level is None:
             raise HierarchyError("HierarchicalVecEnv needs a high level that proposes options: set .high_level")
         seen = {key: observation[key][where] for key in GOAL_KEYS}
-        proposal = self.high_level(self.layout.high(seen), where)
+        proposal = self.high_level(self.views.high(seen), where)
         unit = proposal.unit_actions if self.schedule is None else self.schedule(proposal.unit_actions, seen)
-        self.clock.begin(where, unit, self.layout.subgoals.unscale(unit[:, :-1]), proposal.testing)
+        self.clock.begin(where, unit, proposal.testing)
 
     def _low_observation(self, observation: GoalObservation) -> FloatArray:
         remaining = self.rules.remaining(self.clock.time_left)
-        return self.layout.low(observation, self.clock.subgoal, remaining)
+        return self.views.low(observation, self.clock.subgoal, remaining)
+
+
+CUT_OFF = (TerminationReason.EPISODE_END.value, TerminationReason.EVENT.value)
+
+
+def _tell_low_level(where: Indices, last: FloatArray, infos: list[dict[str, Any]]) -> None:
+    """Say in ``infos`` how windows ended, as SB3's algorithms expect to be told of episodes."""
+    for index in where:
+        cut = infos[index]["option"]["reason"] in CUT_OFF
+        infos[index] |= {"terminal_observation": last[index], "TimeLimit.truncated": cut}

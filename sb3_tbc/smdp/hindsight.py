@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.options import Episode, OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
-from sb3_tbc.smdp.spaces import FloatArray, SubgoalSpace
+from sb3_tbc.smdp.spaces import SubgoalSpace
 
 GOAL_STRATEGIES = ("future", "episode", "event")
 """Where the high level's hindsight goals come from."""

@@ -7,13 +7,17 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sb3_tbc.smdp.spaces import FloatArray
+from sb3_tbc.arrays import BoolArray, FloatArray, Indices
+from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
 
 class TerminationReason(enum.Enum):
-    """Why an option ended; stored by name."""
+    """What ended an option; stored by name. Whether its subgoal was reached is another question.
+
+    ``REACHED`` is an end *before* the time budget, because the subgoal was reached; ``EXPIRED`` the end of the budget,
+    reached or not; ``EPISODE_END`` and ``EVENT`` cut an option off.
+    """
 
     REACHED = "reached"
     EXPIRED = "expired"
@@ -55,6 +59,22 @@ class OptionRules:
     def dt_ref(self) -> float:
         """The typical window, which sets the scale of the SMDP reward and discount."""
         return self.dt_max / 2.0
+
+    @property
+    def ends_when_reached(self) -> bool:
+        """Whether a window ends as soon as its subgoal is reached."""
+        return self.window_end == "reached"
+
+    def completed(self, expired: BoolArray, reached: BoolArray | None, may_end: BoolArray | bool = True) -> BoolArray:
+        """Which windows have run to an end of their own, which nothing from outside cut off.
+
+        This is the one rule of a window's end: the agent acts by it, both levels learn by it.
+
+        :param expired: whose time budget is spent
+        :param reached: whose subgoal is reached; may be None where that ends no window
+        :param may_end: whose window is old enough (``dt_min``) to end by reaching its subgoal
+        """
+        return expired | (reached & may_end) if self.ends_when_reached and reached is not None else expired
 
     def budget(self, unit: FloatArray) -> FloatArray:
         """Time budget in steps of a unit action coordinate in [-1, 1]."""
@@ -108,6 +128,7 @@ class Episode(NamedTuple):
     options: tuple[Option, ...]
     terminated: bool
     success: bool
+    budget_exhausted: bool = False  # it ended because the high level's decisions were used up
 
     @property
     def length(self) -> int:
@@ -118,33 +139,40 @@ class Episode(NamedTuple):
 class OptionClock:
     """The SMDP clock: the live option of every environment of a vector.
 
+    The same clock runs while an agent learns, is evaluated, and in ``predict``, which carries its fields
+    :attr:`carried` from call to call.
+
     :param n_envs: number of environments
-    :param subgoal_dim: size of a subgoal
+    :param subgoals: what may be asked for
     :param rules: what ends an option
     """
 
-    fields = ("unit_action", "subgoal", "time_budget", "testing", "elapsed", "used")
-    """The arrays that hold its state, one row per environment."""
+    carried = ("subgoal", "time_budget", "elapsed", "used")
+    """What acting needs of it, one row per environment."""
+    fields = ("unit_action", *carried, "testing")
+    """All that it holds."""
 
-    def __init__(self, n_envs: int, subgoal_dim: int, rules: OptionRules) -> None:
-        self.rules = rules
-        self.unit_action = np.zeros((n_envs, subgoal_dim + 1))
-        self.subgoal = np.zeros((n_envs, subgoal_dim))
+    def __init__(self, n_envs: int, subgoals: SubgoalSpace, rules: OptionRules) -> None:
+        self.subgoals, self.rules = subgoals, rules
+        self.unit_action = np.zeros((n_envs, subgoals.dim + 1))
+        self.subgoal = np.zeros((n_envs, subgoals.dim))
         self.time_budget = np.zeros(n_envs)
         self.testing = np.zeros(n_envs, dtype=bool)
         self.elapsed = np.zeros(n_envs, dtype=np.int64)
         self.used = np.zeros(n_envs, dtype=np.int64)
 
-    def begin_episode(self, indices: NDArray[np.intp]) -> None:
+    def begin_episode(self, indices: Indices) -> None:
         """Forget the options used so far in the environments ``indices``."""
         self.used[indices] = 0
 
-    def begin(
-        self, indices: NDArray[np.intp], unit_action: FloatArray, subgoal: FloatArray, testing: NDArray[np.bool_]
-    ) -> None:
-        """Start a new option in each environment of ``indices``; arrays have one row per index."""
+    def begin(self, indices: Indices, unit_action: FloatArray, testing: BoolArray | bool = False) -> None:
+        """Start a new option in each environment of ``indices``.
+
+        :param unit_action: subgoal and time budget in [-1, 1], one row per index
+        :param testing: whether the option is a subgoal test
+        """
         self.unit_action[indices] = unit_action
-        self.subgoal[indices] = subgoal
+        self.subgoal[indices] = self.subgoals.unscale(unit_action[:, :-1])
         self.time_budget[indices] = self.rules.budget(unit_action[:, -1])
         self.testing[indices] = testing
         self.elapsed[indices] = 0
@@ -160,21 +188,45 @@ class OptionClock:
         return self.time_budget - self.elapsed
 
     @property
-    def expired(self) -> NDArray[np.bool_]:
+    def expired(self) -> BoolArray:
         """Whose time budget is spent, ``(n_envs,)``."""
         return np.asarray(self.elapsed >= self.time_budget)
 
-    def close(self, index: int, step: int, reached: bool, episode_over: bool, event: bool = False) -> Option:
-        """The option of environment ``index`` as a record; ``step`` is the number of steps of its episode so far."""
-        expired = bool(self.elapsed[index] >= self.time_budget[index])
+    @property
+    def may_end(self) -> BoolArray:
+        """Whose window is old enough to end by reaching its subgoal, ``(n_envs,)``."""
+        return np.asarray(self.elapsed >= self.rules.dt_min)
+
+    def ended(self, seen: GoalObservation) -> BoolArray:
+        """Whose window is over, ``(n_envs,)``: by its own rule, or by the task's event.
+
+        :param seen: what the last step led to
+        """
+        reached = self.reached(seen) if self.rules.ends_when_reached else None
+        over = self.rules.completed(self.expired, reached, self.may_end)
+        return over if self.subgoals.event is None else over | self.subgoals.happened(seen)
+
+    def reached(self, seen: GoalObservation, where: Indices | slice = slice(None)) -> BoolArray:
+        """Whose subgoal is reached, of the environments ``where`` that ``seen`` has rows of."""
+        return self.subgoals.reached(self.subgoals.achieved(seen), self.subgoal[where])
+
+    def close(self, index: int, step: int, reached: bool, episode_over: bool) -> Option:
+        """The option of environment ``index`` as a record.
+
+        An option that was cut off did not get to show whether it reaches its subgoal: it counts as not reached.
+
+        :param step: the number of steps of its episode so far
+        :param reached: whether its subgoal is reached now
+        :param episode_over: whether the episode ends with this step; if not, and the window is not at an end of its
+            own, the task's event ended it
+        """
+        expired, early = self.expired[index], self.may_end[index]
         if expired:
-            reason = TerminationReason.REACHED if reached else TerminationReason.EXPIRED
-        elif episode_over:
-            reason = TerminationReason.EPISODE_END
-        elif event:
-            reason = TerminationReason.EVENT
-        else:
+            reason = TerminationReason.EXPIRED
+        elif self.rules.completed(expired, np.asarray(reached), early):
             reason = TerminationReason.REACHED
+        else:
+            reason = TerminationReason.EPISODE_END if episode_over else TerminationReason.EVENT
         duration = int(self.elapsed[index])
         return Option(
             start=step - duration,
@@ -183,7 +235,6 @@ class OptionClock:
             subgoal=self.subgoal[index].copy(),
             time_budget=float(self.time_budget[index]),
             testing=bool(self.testing[index]),
-            # an option that was cut off did not get to show whether it reaches its subgoal
-            reached=reached and reason is TerminationReason.REACHED,
+            reached=reached and reason in (TerminationReason.EXPIRED, TerminationReason.REACHED),
             reason=reason,
         )

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.options import Episode, Option, TerminationReason
-from sb3_tbc.smdp.spaces import FloatArray, GoalObservation
+from sb3_tbc.smdp.spaces import GoalObservation
 
 REASONS = tuple(TerminationReason)
 
@@ -58,7 +59,7 @@ class EpisodeRecorder:
         self.steps += 1
         self._write(self._now(), observation)
 
-    def finish(self, index: int, terminated: bool, success: bool) -> Episode:
+    def finish(self, index: int, terminated: bool, success: bool, budget_exhausted: bool = False) -> Episode:
         """The episode that has just ended in environment ``index``, as arrays of its own."""
         length = int(self.steps[index])
         seen = {n: self._data[n][index, : length + 1].copy() for n in ("observation", *self._exact)}
@@ -70,6 +71,7 @@ class EpisodeRecorder:
             options=tuple(self.options[index]),
             terminated=terminated,
             success=success,
+            budget_exhausted=budget_exhausted,
         )
 
     def get_state(self) -> dict[str, NDArray[Any]]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.options import OptionRules
-from sb3_tbc.smdp.spaces import FloatArray, SubgoalSpace
+from sb3_tbc.smdp.spaces import SubgoalSpace
 
 KINDS = ("sparse", "dense", "step")
 
@@ -61,7 +62,7 @@ class LowLevelReward:
         reached = self.subgoals.reached(achieved, subgoal)
         if self.kind == "step":
             return reached.astype(np.float64) - 1.0, reached
-        over = expired | (reached & may_end) if self.rules.window_end == "reached" else expired
+        over = self.rules.completed(expired, reached, may_end)
         rewards = (over & reached).astype(np.float64)
         if self.kind == "dense":
             rewards += self.completion(achieved, subgoal) - self.completion(here, subgoal)

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-FloatArray = NDArray[np.floating[Any]]
+from sb3_tbc.arrays import FloatArray as FloatArray
+
 GoalObservation = Mapping[str, NDArray[Any]]
 """A goal environment's observation: ``observation``, ``achieved_goal``, ``desired_goal``, single or batched."""
 

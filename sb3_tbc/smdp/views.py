@@ -1,41 +1,18 @@
-"""What each level sees: goal observations and how they become the levels' flat observation vectors."""
+"""What each level sees of the task: how goal observations become the levels' flat observation vectors."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 
-from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
-
-GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
-
-
-def check_goal_space(space: spaces.Space[Any]) -> spaces.Dict:
-    """Return the space if it is that of a goal environment.
-
-    :raises ValueError: naming what is missing
-    """
-    if not isinstance(space, spaces.Dict) or any(key not in space.spaces for key in GOAL_KEYS):
-        found = sorted(space.spaces) if isinstance(space, spaces.Dict) else type(space).__name__
-        raise ValueError(
-            f"a hierarchical agent needs a goal environment: a Dict observation with the keys {sorted(GOAL_KEYS)}, "
-            f"got {found}. Derive it from gymnasium_robotics.core.GoalEnv."
-        )
-    for key in GOAL_KEYS:
-        part = space.spaces[key]
-        if not isinstance(part, spaces.Box) or len(part.shape) != 1:
-            raise ValueError(f"observation[{key!r}] must be a Box with one dimension, got {part}")
-    return space
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.goal_spaces import width
+from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
 
-def width(space: spaces.Dict, key: str) -> int:
-    """Number of entries of a part of a goal observation."""
-    return int(np.prod(space.spaces[key].shape or ()))
-
-
-class LevelLayout(NamedTuple):
+class LevelViews(NamedTuple):
     """How the flat observation and action vectors of both levels are put together."""
 
     subgoals: SubgoalSpace
@@ -83,3 +60,7 @@ class LevelLayout(NamedTuple):
         """Fixed scales that bring the low level's observation to about [-1, 1]."""
         time = [1.0] if self.remaining_time else []
         return np.concatenate([self.subgoals.local_scale, self.subgoals.resolution_scale, time])
+
+
+LevelLayout = LevelViews
+"""Its former name."""

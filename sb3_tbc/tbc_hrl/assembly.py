@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 def make_high_level(model: TBCHRL, observation: spaces.Box, action: spaces.Box, seed: int) -> SACLevel:
     """The level that chooses subgoals and time budgets.
 
-    :param observation: what it sees, :meth:`~sb3_tbc.smdp.views.LevelLayout.high_space`
-    :param action: what it chooses, :meth:`~sb3_tbc.smdp.views.LevelLayout.high_action_space`
+    :param observation: what it sees, :meth:`~sb3_tbc.smdp.views.LevelViews.high_space`
+    :param action: what it chooses, :meth:`~sb3_tbc.smdp.views.LevelViews.high_action_space`
     """
     settings = model.high_settings
     return _make_level(

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.level.level import SACLevel
+from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.replay.both_levels import Replay
-from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal, Schedule
+from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep, HierarchicalVecEnv, Proposal, Schedule
 from sb3_tbc.smdp.hindsight import (
     GoalRange,
     GoalTest,
@@ -22,8 +22,9 @@ from sb3_tbc.smdp.hindsight import (
 )
 from sb3_tbc.smdp.options import Episode, OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
-from sb3_tbc.smdp.spaces import FloatArray, GoalObservation
-from sb3_tbc.smdp.views import LevelLayout
+from sb3_tbc.smdp.spaces import GoalObservation
+from sb3_tbc.smdp.views import LevelViews
+from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 
 
 class Exploration(NamedTuple):
@@ -32,58 +33,88 @@ class Exploration(NamedTuple):
     random_fraction: float  # share of uniformly random actions on each level
     testing_fraction: float  # share of options that test their subgoal
     deterministic_testing: bool  # whether the low level acts deterministically in a test
-    memory: str  # when the membrane is reset: "window", "episode" or "none"
 
 
-def forget(
-    membrane: FloatArray, memory: str, window_over: NDArray[np.bool_], infos: Sequence[dict[str, Any]]
-) -> FloatArray:
-    """Membrane potentials ``(n_envs, state_dim)`` after a step, reset where ``memory`` ends.
-
-    :param window_over: whose option ended with the step
-    :param infos: the step's infos; ``"episode_over"`` marks the end of an episode
-    """
-    if not membrane.shape[1]:
-        return membrane
-    if memory == "none":
-        return np.zeros(membrane.shape, dtype=np.float32)
-    over = window_over if memory == "window" else np.array(["episode_over" in info for info in infos])
-    return np.where(over[:, None], np.float32(0.0), membrane) if over.any() else membrane
-
-
-class Collector:
-    """Both levels exploring a vector of goal environments.
+class TwoLevelRunner:
+    """Both levels at work in a vector of goal environments, step by step.
 
     :param venv: the environments
-    :param high: proposes options
-    :param low: executes them
-    :param exploration: see :class:`Exploration`
+    :param actor: both levels
+    :param views: what each level sees
+    :param rules: what ends an option
     :param rng: source of all randomness here
     :param schedule: gives the time budgets where the high level does not
+    :param deterministic: act as in an evaluation
     """
 
     def __init__(
         self,
         venv: VecEnv,
-        high: SACLevel,
-        low: SACLevel,
-        layout: LevelLayout,
+        actor: TwoLevelActor,
+        views: LevelViews,
         rules: OptionRules,
-        exploration: Exploration,
         rng: np.random.Generator,
         schedule: Schedule | None = None,
+        deterministic: bool = False,
     ) -> None:
-        self.high, self.low, self.rng = high, low, rng
-        self.exploration = exploration
-        self.env = HierarchicalVecEnv(venv, self.propose, layout, rules, low.state_dim, schedule)
-        self.reset()
+        self.actor, self.rng, self.deterministic = actor, rng, deterministic
+        self.env = HierarchicalVecEnv(venv, self.propose, views, rules, actor.low.state_dim, schedule)
+        self.membrane = actor.blank(venv.num_envs)
+        self.observation: FloatArray = np.zeros(0)  # the low level's
 
     def reset(self) -> None:
         """Begin new episodes."""
-        self.membrane: FloatArray = np.zeros((self.env.num_envs, self.low.state_dim), dtype=np.float32)
-        self.observation: FloatArray = self.env.reset()
+        self.begin(self.env.venv.reset())  # type: ignore[arg-type]
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def begin(self, observation: GoalObservation) -> None:
+        """Begin episodes in environments that were just reset.
+
+        :param observation: what the environments show
+        """
+        self.membrane = self.actor.blank(self.env.num_envs)
+        self.observation = self.env.begin(observation)
+
+    def step(self) -> HierarchicalStep:
+        """One step of every environment."""
+        before = self.membrane
+        unit, after = self.act()
+        step = self.env.advance(unit, before, after)
+        self.observation = step.observations
+        self.membrane = self.actor.forget(after, step.window_over, step.episode_over)
+        return step
+
+    def propose(self, observations: FloatArray, where: Indices) -> Proposal:
+        """The high level's options for the environments ``where``."""
+        unit = self.actor.propose(observations, self.deterministic, self.rng)
+        return Proposal(unit, np.zeros(len(where), dtype=bool))
+
+    def act(self) -> tuple[FloatArray, FloatArray]:
+        """The low level's unit actions for every environment, and its memory after them."""
+        return self.actor.act(self.observation, self.membrane, self.deterministic, self.rng)
+
+
+class Collector(TwoLevelRunner):
+    """Both levels exploring.
+
+    :param exploration: see :class:`Exploration`
+
+    Other parameters are :class:`TwoLevelRunner`'s.
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        actor: TwoLevelActor,
+        views: LevelViews,
+        rules: OptionRules,
+        rng: np.random.Generator,
+        schedule: Schedule | None,
+        exploration: Exploration,
+    ) -> None:
+        super().__init__(venv, actor, views, rules, rng, schedule)
+        self.exploration = exploration
+
+    def get_state(self) -> Arrays:
         """Live options, running episodes and memory, as plain arrays."""
         return {**self.env.get_state(), "membrane": self.membrane, "observation": self.observation}
 
@@ -96,43 +127,28 @@ class Collector:
         self.membrane, self.observation = state["membrane"].astype(np.float32), seen
         return np.array_equal(seen, state["observation"])
 
-    def step(self) -> list[dict[str, Any]]:
-        """One step of every environment; the infos it gave."""
-        observation, _, window_over, infos = self.env.step(self.env.unscale(self.act()))
-        self.observation = np.asarray(observation)
-        self.membrane = forget(self.membrane, self.exploration.memory, window_over, infos)
-        return list(infos)
-
-    def take_episodes(self) -> list[Episode]:
-        """The episodes finished since the last call."""
-        episodes, self.env.episodes = self.env.episodes, []
-        return episodes
-
-    def propose(self, observations: FloatArray, where: NDArray[np.intp]) -> Proposal:
+    def propose(self, observations: FloatArray, where: Indices) -> Proposal:
         """The exploring high level: mostly SAC samples, sometimes uniform, some of them tests."""
-        n = len(where)
-        unit, _ = self.high.act(observations, np.zeros((n, 0), dtype=np.float32), False, self.rng)
+        unit = self.actor.propose(observations, False, self.rng)
         self._randomise(unit)
-        return Proposal(unit.astype(np.float64), self.rng.random(n) < self.exploration.testing_fraction)
+        return Proposal(unit, self.rng.random(len(where)) < self.exploration.testing_fraction)
 
-    def act(self) -> FloatArray:
-        """The exploring low level's unit actions for every environment."""
-        before = self.membrane
+    def act(self) -> tuple[FloatArray, FloatArray]:
+        """The exploring low level: mostly SAC samples, sometimes uniform; the means in tests, if asked for."""
         tested = self.env.clock.testing if self.exploration.deterministic_testing else False
-        unit, after = self.low.act(self.observation, before, tested, self.rng)
+        unit, after = self.actor.act(self.observation, self.membrane, tested, self.rng)
         self._randomise(unit, tested)
-        self.env.remember(before, after)
-        self.membrane = after
-        return unit
+        return unit, after
 
-    def _randomise(self, unit: FloatArray, spared: bool | NDArray[np.bool_] = False) -> None:
+    def _randomise(self, unit: FloatArray, spared: bool | BoolArray = False) -> None:
         """Replace a share of the actions by uniform ones, in place; not those of a mask ``(n,)``."""
         uniform = self.rng.random(len(unit)) < self.exploration.random_fraction
         if not np.count_nonzero(uniform):
             return
         if spared is not False:
             uniform &= np.logical_not(spared)
-        unit[uniform] = self.rng.uniform(-1.0, 1.0, (np.count_nonzero(uniform), unit.shape[1]))
+        drawn = self.rng.uniform(-1.0, 1.0, (np.count_nonzero(uniform), unit.shape[1]))
+        unit[uniform] = drawn.astype(np.float32)  # as a level's own actions
 
 
 class EpisodeStore:
@@ -149,7 +165,7 @@ class EpisodeStore:
     def __init__(
         self,
         replay: Replay,
-        layout: LevelLayout,
+        views: LevelViews,
         rules: OptionRules,
         reward: HighLevelReward,
         low_reward: LowLevelReward,
@@ -158,17 +174,17 @@ class EpisodeStore:
         asked: GoalRange | None = None,
     ) -> None:
         self.asked = asked
-        self.replay, self.layout, self.rules = replay, layout, rules
+        self.replay, self.views, self.rules = replay, views, rules
         self.reward, self.low_reward, self.hindsight, self.rng = reward, low_reward, hindsight, rng
 
     def add(self, episode: Episode, goal_test: GoalTest) -> HighLevelSteps:
         """Store an episode; what the high level learns from it."""
-        subgoals = self.layout.subgoals
+        subgoals = self.views.subgoals
         if self.asked is not None:
             self.asked.add(episode.desired_goal[0])
         self.replay.low.extend(low_level_steps(episode, subgoals, self.rules, self.low_reward))
         steps = high_level_steps(
-            episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.layout.high, self.rng,
+            episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.views.high, self.rng,
             self.asked,
         )  # fmt: skip
         self.replay.high.extend(steps)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal
-from sb3_tbc.smdp.spaces import FloatArray
-from sb3_tbc.tbc_hrl.collection import forget
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.options import Episode
+from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 
@@ -101,11 +101,13 @@ def evaluate_hierarchical(
     :raises ValueError: if ``n_eval_episodes`` is not positive
     """
     venv = _vector(env, n_eval_episodes)
-    runner = _Runner(model, venv, deterministic, np.random.default_rng(seed))
+    runner = TwoLevelRunner(
+        venv, model.actor, model.layout, model.rules, np.random.default_rng(seed), model.schedule, deterministic
+    )
     if seed is not None:
         venv.seed(seed)
     per_env = -(-n_eval_episodes // venv.num_envs)
-    return _columns(runner.run(per_env), n_eval_episodes)
+    return _columns(_run(runner, per_env), n_eval_episodes)
 
 
 def _vector(env: VecEnv | gym.Env[Any, Any], n_eval_episodes: int) -> VecEnv:
@@ -120,45 +122,25 @@ def _columns(rows: list[tuple[Any, ...]], n_eval_episodes: int) -> EvaluationRes
     return EvaluationResult(*(np.array(column, dtype=t) for column, t in zip(columns, types, strict=True)))
 
 
-class _Runner:
-    """Drives a hierarchical vector environment with both levels' policies."""
+def _run(runner: TwoLevelRunner, per_env: int) -> list[tuple[Any, ...]]:
+    """``per_env`` episodes in every environment; one row each, ordered by round, then environment."""
+    runner.reset()
+    results: list[list[tuple[Any, ...]]] = [[] for _ in range(runner.env.num_envs)]
+    while min(len(rows) for rows in results) < per_env:
+        for index, episode in runner.step().episodes.items():
+            results[index].append(_row(episode))
+    return [rows[i] for i in range(per_env) for rows in results]
 
-    def __init__(self, model: TBCHRL, venv: VecEnv, deterministic: bool, rng: np.random.Generator) -> None:
-        self.model, self.deterministic, self.rng = model, deterministic, rng
-        self.env = HierarchicalVecEnv(venv, self._propose, model.layout, model.rules, schedule=model.schedule)
 
-    def _propose(self, observations: FloatArray, where: NDArray[np.intp]) -> Proposal:
-        no_state = np.zeros((len(where), 0), dtype=np.float32)
-        unit, _ = self.model.high.act(observations, no_state, self.deterministic, self.rng, average=self.deterministic)
-        return Proposal(unit.astype(np.float64), np.zeros(len(where), dtype=bool))
-
-    def run(self, per_env: int) -> list[tuple[Any, ...]]:
-        """``per_env`` episodes in every environment; one row each, ordered by round, then environment."""
-        model, env = self.model, self.env
-        observation = env.reset()
-        state_dim = model.low.policy.actor.state_dim
-        membrane = np.zeros((env.num_envs, state_dim), dtype=np.float32)
-        results: list[list[tuple[Any, ...]]] = [[] for _ in range(env.num_envs)]
-        while min(len(rows) for rows in results) < per_env:
-            unit, membrane = model.low.act(
-                observation, membrane, self.deterministic, self.rng, average=self.deterministic
-            )
-            seen, _, window_over, infos = env.step(model.policy._unscale(unit))
-            observation = np.asarray(seen)
-            membrane = forget(membrane, model.memory, window_over, infos)
-            over = [index for index in range(env.num_envs) if infos[index].get("episode_over")]
-            for index, episode in zip(over, env.episodes, strict=True):
-                options = episode.options
-                results[index].append(
-                    (
-                        episode.success,
-                        episode.length,
-                        episode.rewards.sum(),
-                        np.mean([option.reached for option in options]),
-                        np.mean([option.duration for option in options]),
-                        len(options),
-                        infos[index]["budget_exhausted"],
-                    )
-                )
-            env.episodes = []
-        return [rows[i] for i in range(per_env) for rows in results]
+def _row(episode: Episode) -> tuple[Any, ...]:
+    """What :class:`EvaluationResult` holds of an episode, in its order."""
+    options = episode.options
+    return (
+        episode.success,
+        episode.length,
+        episode.rewards.sum(),
+        np.mean([option.reached for option in options]),
+        np.mean([option.duration for option in options]),
+        len(options),
+        episode.budget_exhausted,
+    )

@@ -10,18 +10,20 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_tbc.arrays import BoolArray, FloatArray
 from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import NDBCActor
 from sb3_tbc.ndbc.diagnostics import check_finite
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions
 from sb3_tbc.smdp.hierarchical_vec_env import Schedule
-from sb3_tbc.smdp.options import OptionRules
-from sb3_tbc.smdp.spaces import FloatArray
-from sb3_tbc.smdp.views import GOAL_KEYS, LevelLayout
+from sb3_tbc.smdp.options import OptionClock, OptionRules
+from sb3_tbc.smdp.views import LevelViews
+from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 
 
 class TwoLevelState(NamedTuple):
-    """What ``predict`` hands on from step to step, one row per environment."""
+    """What ``predict`` hands on from step to step, one row per environment: the option's clock and the memory."""
 
     subgoal: FloatArray  # (n, subgoal_dim), task units
     time_budget: FloatArray  # (n,), steps
@@ -37,7 +39,7 @@ class TBCPolicy(BasePolicy):
     :param action_space: the task's action box
     :param high: the high level
     :param low: the low level
-    :param layout: how the levels' observations are put together
+    :param views: what each level sees
     :param rules: what ends an option
     :param memory: when the membrane is reset: at each new ``"window"``, ``"episode"``, or at every step (``"none"``)
     :param seed: of the noise that ``predict(deterministic=False)`` draws
@@ -50,7 +52,7 @@ class TBCPolicy(BasePolicy):
         action_space: spaces.Box,
         high: SACLevel,
         low: SACLevel,
-        layout: LevelLayout,
+        views: LevelViews,
         rules: OptionRules,
         memory: str,
         seed: int | None = None,
@@ -58,19 +60,14 @@ class TBCPolicy(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.high_policy, self.low_policy = high.policy, low.policy
-        self._levels = (high, low)
-        self.layout, self.rules, self.memory, self.schedule = layout, rules, memory, schedule
+        self.actor = TwoLevelActor(high, low, memory)
+        self.views, self.rules, self.memory, self.schedule = views, rules, memory, schedule
+        self.unit: Any = UnitActions(action_space)
         self.rng = np.random.default_rng(seed)
 
     def initial_state(self, n_envs: int) -> TwoLevelState:
         """State of ``n_envs`` environments that have not begun an option."""
-        return TwoLevelState(
-            np.zeros((n_envs, self.layout.subgoals.dim)),
-            np.zeros(n_envs),
-            np.zeros(n_envs, dtype=np.int64),
-            np.zeros(n_envs, dtype=np.int64),
-            np.zeros((n_envs, self._levels[1].policy.actor.state_dim), dtype=np.float32),
-        )
+        return _packed(OptionClock(n_envs, self.views.subgoals, self.rules), self.actor.blank(n_envs))
 
     def predict(
         self,
@@ -92,47 +89,44 @@ class TBCPolicy(BasePolicy):
         """
         batch, single = self._as_batch(observation)
         n = len(batch["observation"])
-        now = self.initial_state(n) if state is None else TwoLevelState(*(np.array(part) for part in state))
+        clock, membrane = self._unpacked(n, state)
         starts = np.ones(n, bool) if state is None else np.zeros(n, bool)
         if episode_start is not None:
             starts |= np.asarray(episode_start, dtype=bool)
-        self._begin_options(now, batch, starts, deterministic)
-        remaining = self.rules.remaining(now.time_budget - now.elapsed)
-        seen = self.layout.low(batch, now.subgoal, remaining)
-        unit, membrane = self._levels[1].act(seen, now.membrane, deterministic, self.rng, average=deterministic)
+        over = self._begin_options(clock, batch, starts, deterministic)
+        seen = self.views.low(batch, clock.subgoal, self.rules.remaining(clock.time_left))
+        membrane = self.actor.forget(membrane, over, starts)
+        unit, membrane = self.actor.act(seen, membrane, deterministic, self.rng)
         if not np.isfinite(unit).all():
-            self._name_non_finite(seen, membrane, unit, now.elapsed)
-        actions = self._unscale(unit)
-        after = now._replace(elapsed=now.elapsed + 1, membrane=membrane)
-        return (actions[0] if single else actions), cast("tuple[NDArray[Any], ...]", after)
+            self._name_non_finite(seen, membrane, unit, clock.elapsed)
+        actions = self.unit.unscale(unit)
+        clock.tick()
+        return (actions[0] if single else actions), cast("tuple[NDArray[Any], ...]", _packed(clock, membrane))
+
+    def _unpacked(self, n: int, state: tuple[NDArray[Any], ...] | None) -> tuple[OptionClock, FloatArray]:
+        """Clock and memory of a state, copied."""
+        clock = OptionClock(n, self.views.subgoals, self.rules)
+        if state is None:
+            return clock, self.actor.blank(n)
+        given = TwoLevelState(*state)
+        for name in OptionClock.carried:
+            getattr(clock, name)[:] = getattr(given, name)
+        return clock, np.array(given.membrane, dtype=np.float32)
 
     def _begin_options(
-        self, now: TwoLevelState, batch: dict[str, NDArray[Any]], starts: NDArray[np.bool_], deterministic: bool
-    ) -> None:
-        """Replace the options that are over, in place."""
-        now.used[starts] = 0
-        over = starts | (now.elapsed >= now.time_budget) | (self.layout.subgoals.happened(batch) & (now.elapsed > 0))
-        if self.rules.window_end == "reached":
-            reached = self.layout.subgoals.reached(self.layout.subgoals.achieved(batch), now.subgoal)
-            over |= reached & (now.elapsed >= self.rules.dt_min)
-        forget = {"window": over, "episode": starts, "none": np.ones_like(over)}[self.memory]
-        now.membrane[forget] = 0.0
+        self, clock: OptionClock, batch: dict[str, NDArray[Any]], starts: BoolArray, deterministic: bool
+    ) -> BoolArray:
+        """Replace the options that are over, in place; which they are."""
+        over = starts | clock.ended(batch)
+        clock.begin_episode(np.flatnonzero(starts))
         where = np.flatnonzero(over)
         if len(where):
             seen = {key: batch[key][where] for key in GOAL_KEYS}
-            no_state = np.zeros((len(where), 0), dtype=np.float32)
-            unit, _ = self._levels[0].act(
-                self.layout.high(seen), no_state, deterministic, self.rng, average=deterministic
-            )
+            unit = self.actor.propose(self.views.high(seen), deterministic, self.rng)
             if not np.isfinite(unit).all():
                 raise NonFiniteError(f"high level, subgoal or time budget {unit.tolist()} for observation {seen}")
-            unit = unit.astype(np.float64)  # as while learning: a rounding error can change the length of a window
-            if self.schedule is not None:
-                unit = self.schedule(unit, seen)
-            now.subgoal[where] = self.layout.subgoals.unscale(unit[:, :-1])
-            now.time_budget[where] = self.rules.budget(unit[:, -1])
-            now.elapsed[where] = 0
-            now.used[where] += 1
+            clock.begin(where, unit if self.schedule is None else self.schedule(unit, seen))
+        return over
 
     def _name_non_finite(
         self, seen: FloatArray, membrane: FloatArray, unit: FloatArray, elapsed: NDArray[np.int64]
@@ -153,10 +147,6 @@ class TBCPolicy(BasePolicy):
         single = batch["observation"].ndim == 1
         return ({key: part[None] for key, part in batch.items()} if single else batch), single
 
-    def _unscale(self, unit: FloatArray) -> FloatArray:
-        space = cast(spaces.Box, self.action_space)
-        return (space.low + 0.5 * (unit + 1.0) * (space.high - space.low)).astype(space.dtype)
-
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """SB3's tensor form of a single, memoryless step."""
         batch = {key: np.asarray(part) for key, part in observation.items()}
@@ -165,3 +155,7 @@ class TBCPolicy(BasePolicy):
     def forward(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         """Same as ``_predict``."""
         return self._predict(observation, deterministic)
+
+
+def _packed(clock: OptionClock, membrane: FloatArray) -> TwoLevelState:
+    return TwoLevelState(**{name: getattr(clock, name) for name in OptionClock.carried}, membrane=membrane)

@@ -9,9 +9,10 @@ import torch as th
 from torch import nn
 from torch.nn import functional
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.replay.buffers import ReachPairs, SubgoalReplayBuffer
 from sb3_tbc.replay.ring import Float32
-from sb3_tbc.smdp.spaces import FloatArray, SubgoalSpace
+from sb3_tbc.smdp.spaces import SubgoalSpace
 
 UPDATE_EVERY = 4
 """Environment steps per update of the estimate."""

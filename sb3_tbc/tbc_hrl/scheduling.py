@@ -6,11 +6,12 @@ import math
 
 import numpy as np
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.ring import Float32
 from sb3_tbc.smdp.options import OptionRules
-from sb3_tbc.smdp.spaces import FloatArray, GoalObservation
-from sb3_tbc.smdp.views import LevelLayout
+from sb3_tbc.smdp.spaces import GoalObservation
+from sb3_tbc.smdp.views import LevelViews
 from sb3_tbc.tbc_hrl.reachability import Reachability
 
 
@@ -39,17 +40,17 @@ class FixedWindows:
 class ReachRule:
     """Time budgets by the rule ``dt* = clip(kappa * H_reach(s, g), dt_min, dt_max)`` (paper, equation 1).
 
-    :param layout: reads state and place out of goal observations
+    :param views: reads state and place out of goal observations
     :param rules: bounds of a time budget
     :param reachability: the estimate of ``H_reach``
     :param kappa: the paper's temporal scaling (table A2), 0.6 to 1.2
     :raises ValueError: if ``kappa`` is not positive
     """
 
-    def __init__(self, layout: LevelLayout, rules: OptionRules, reachability: Reachability, kappa: float) -> None:
+    def __init__(self, views: LevelViews, rules: OptionRules, reachability: Reachability, kappa: float) -> None:
         if kappa <= 0:
             raise ValueError(f"kappa must be positive (the paper's lie in [0.6, 1.2]), got {kappa}")
-        self.layout, self.rules, self.reachability, self.kappa = layout, rules, reachability, kappa
+        self.views, self.rules, self.reachability, self.kappa = views, rules, reachability, kappa
 
     def steps(self, local: FloatArray, here: FloatArray, subgoal: FloatArray) -> FloatArray:
         """Time budgets ``(n,)`` in steps for subgoals in task units."""
@@ -58,7 +59,7 @@ class ReachRule:
 
     def __call__(self, unit_actions: FloatArray, observation: GoalObservation) -> FloatArray:
         """Append the rule's time budget to unit subgoals ``(n, subgoal_dim)``."""
-        subgoals = self.layout.subgoals
+        subgoals = self.views.subgoals
         local, here = subgoals.local(observation), subgoals.achieved(observation)
         unit = self.rules.unit_budget(self.steps(local, here, subgoals.unscale(unit_actions)))
         return np.concatenate([unit_actions, unit[:, None]], axis=1)
@@ -78,5 +79,5 @@ class DurationTeacher:
         """Unit time budgets ``(n,)`` of high-level observations and of the states they were made of."""
         no_state = np.zeros((len(observations), 0), dtype=np.float32)
         unit, _ = self.high.act(observations, no_state, True, self._unused)
-        subgoal = self.rule.layout.subgoals.unscale(unit[:, :-1])
+        subgoal = self.rule.views.subgoals.unscale(unit[:, :-1])
         return self.rule.rules.unit_budget(self.rule.steps(local, here, subgoal)).astype(np.float32)

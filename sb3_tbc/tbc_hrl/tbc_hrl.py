@@ -20,12 +20,14 @@ from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tbc.replay.both_levels import Replay
+from sb3_tbc.smdp.goal_spaces import check_goal_space, width
 from sb3_tbc.smdp.hindsight import GoalRange, check_goal_strategy
-from sb3_tbc.smdp.options import OptionRules
+from sb3_tbc.smdp.options import Episode, OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
-from sb3_tbc.smdp.views import LevelLayout, check_goal_space, width
+from sb3_tbc.smdp.views import LevelLayout
 from sb3_tbc.tbc_hrl import assembly, resume
+from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, Exploration, goal_test_of
 from sb3_tbc.tbc_hrl.config import LEVEL_DEFAULTS, attribute_of, check_settings, episode_length, level_settings
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of
@@ -265,6 +267,11 @@ class TBCHRL(BaseAlgorithm):
 
     # ------------------------------------------------------------------ learning
 
+    @property
+    def actor(self) -> TwoLevelActor:
+        """Both levels acting together."""
+        return self.policy.actor
+
     def learn(
         self: SelfTBCHRL,
         total_timesteps: int,
@@ -286,10 +293,11 @@ class TBCHRL(BaseAlgorithm):
             self._updated_at = 0
         for level in (self.high, self.low):
             level.set_logger(self.logger)
-        explore = Exploration(self.random_fraction, self.testing_fraction, self.deterministic_testing, self.memory)
+        explore = Exploration(self.random_fraction, self.testing_fraction, self.deterministic_testing)
         self.collector = collector = Collector(
-            self.env, self.high, self.low, self.layout, self.rules, explore, self.rng, self.schedule
+            self.env, self.actor, self.layout, self.rules, self.rng, self.schedule, explore
         )
+        collector.reset()
         if resumed:
             resume.set_state(self, collector, resumed)
         callback.on_training_start(locals(), globals())
@@ -321,17 +329,17 @@ class TBCHRL(BaseAlgorithm):
     def collect_rollouts(self, collector: Collector, callback: BaseCallback, total_timesteps: int) -> bool:
         """Act until an episode is over (or the steps are used up) and store it; False if a callback asks to stop."""
         callback.on_rollout_start()
-        episodes = collector.take_episodes()
+        episodes: dict[int, Episode] = {}
         while not episodes and self.num_timesteps < total_timesteps:
-            infos = collector.step()
-            episodes = collector.take_episodes()
+            step = collector.step()
+            episodes, infos = step.episodes, step.infos
             self.num_timesteps += self.n_envs
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._update_info_buffer(infos, np.array(["episode_over" in info for info in infos]))
+            self._update_info_buffer(infos, step.episode_over)
             callback.update_locals(locals())
             if not callback.on_step():
                 return False
-        for episode in episodes:
+        for episode in episodes.values():
             self._episode_num += 1
             self.diagnostics.add(episode, self.store.add(episode, goal_test_of(collector.env.venv)))
         callback.on_rollout_end()

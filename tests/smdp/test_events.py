@@ -46,11 +46,9 @@ def make(env: Any, **settings: Any) -> TBCHRL:
 def test_an_event_ends_every_option(window_end: str) -> None:
     model = make(GoalVecEnv([Bell, Bell]), window_end=window_end, gradient_ratio=0.0)
     model.learn(600)
-    env = model.collector.env
     reasons = []
     for _ in range(300):
-        model.collector.step()
-        for episode in env.episodes:
+        for episode in model.collector.step().episodes.values():
             ends = [option.start + option.duration for option in episode.options]
             assert EVENT in ends
             cut = episode.options[ends.index(EVENT)]
@@ -59,7 +57,6 @@ def test_an_event_ends_every_option(window_end: str) -> None:
                 assert not cut.reached
             reasons += [option.reason for option in episode.options if option is not cut]
             reasons.append(cut.reason)
-        env.episodes.clear()
     assert TerminationReason.EVENT in reasons
 
 

@@ -9,14 +9,16 @@ import pytest
 from corridor import Corridor
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tbc.errors import HierarchyError
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal
+from sb3_tbc.smdp.hindsight import low_level_steps
 from sb3_tbc.smdp.options import OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, discounted_sums
-from sb3_tbc.smdp.views import LevelLayout
+from sb3_tbc.smdp.views import LevelViews
 
 
 class RandomHighLevel:
@@ -38,7 +40,7 @@ def make(n_envs: int, seed: int, goal: float | None = None, limit: int = 50, **r
     subgoals = venv.get_attr("subgoals")[0]
     defaults = {"dt_max": 10.0, "max_options": 7}
     return HierarchicalVecEnv(
-        venv, RandomHighLevel(seed), LevelLayout(subgoals, True), OptionRules(**{**defaults, **rules})
+        venv, RandomHighLevel(seed), LevelViews(subgoals, True), OptionRules(**{**defaults, **rules})
     )
 
 
@@ -48,12 +50,12 @@ def run(env: HierarchicalVecEnv, steps: int, seed: int) -> tuple[list[Any], np.n
     env.reset()
     episodes, flags, rewarded = [], [], 0.0
     for _ in range(steps):
-        _, rewards, dones, infos = env.step(rng.uniform(-1, 1, (env.num_envs, 1)).astype(np.float32))
-        assert all(("option" in info) == bool(done) for info, done in zip(infos, dones, strict=True))
-        flags.append(dones)
-        rewarded += rewards.sum()
-        episodes += env.episodes
-        env.episodes = []
+        step = env.advance(rng.uniform(-1, 1, (env.num_envs, 1)).astype(np.float32))
+        assert all(("option" in info) == bool(over) for info, over in zip(step.infos, step.window_over, strict=True))
+        assert set(step.episodes) == set(np.flatnonzero(step.episode_over))
+        flags.append(step.window_over)
+        rewarded += step.rewards.sum()
+        episodes += step.episodes.values()
     return episodes, np.array(flags), int(rewarded)
 
 
@@ -118,20 +120,21 @@ def test_reached_ends_a_window_but_not_before_dt_min() -> None:
     assert min(o.duration for e in held for o in e.options[:-1]) >= 4
 
 
+def to_the_right(env: HierarchicalVecEnv) -> Any:
+    """The first episode of an agent that always goes right."""
+    env.reset()
+    while True:
+        step = env.advance(np.ones((1, 1), np.float32))
+        if step.episodes:
+            return step.episodes[0]
+
+
 def test_truncation_and_termination_are_told_apart() -> None:
-    goal_right = make(1, 0, goal=0.3, limit=50)
-    goal_right.reset()
-    while not goal_right.episodes:
-        goal_right.step(np.ones((1, 1), np.float32))
-    success = goal_right.episodes[0]
+    success = to_the_right(make(1, 0, goal=0.3, limit=50))
     assert success.terminated
     assert success.success
     assert success.length == 3
-    timeout = make(1, 0, goal=5.0, limit=12, max_options=50)
-    timeout.reset()
-    while not timeout.episodes:
-        timeout.step(np.ones((1, 1), np.float32))
-    cut = timeout.episodes[0]
+    cut = to_the_right(make(1, 0, goal=5.0, limit=12, max_options=50))
     assert not cut.terminated
     assert not cut.success
     assert cut.length == 12
@@ -169,7 +172,7 @@ def test_environment_without_goals_is_refused() -> None:
     import gymnasium as gym
 
     venv = DummyVecEnv([lambda: gym.make("MountainCarContinuous-v0")])
-    layout = LevelLayout(Corridor().subgoals, True)
+    layout = LevelViews(Corridor().subgoals, True)
     with pytest.raises(ValueError, match="goal environment"):
         HierarchicalVecEnv(venv, None, layout, OptionRules(5.0))
 
@@ -186,3 +189,51 @@ def test_environment_without_goals_is_refused() -> None:
 def test_impossible_rules_are_refused(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         OptionRules(**kwargs)
+
+
+def test_a_subgoal_reached_as_the_task_succeeds_counts_as_reached() -> None:
+    """One step is both: the high level's test passes, as the low level's step earns its reward."""
+    space = Corridor().subgoals
+    env = HierarchicalVecEnv(
+        DummyVecEnv([lambda: Corridor(goal=0.3)]),
+        lambda seen, where: Proposal(np.array([[0.3, 1.0]]), np.ones(1, bool)),
+        LevelViews(space),
+        OptionRules(10.0, window_end="reached"),
+    )
+    episode = to_the_right(env)
+    (option,) = episode.options
+    assert episode.terminated
+    assert option.reached
+    assert option.reason is TerminationReason.REACHED
+    low = low_level_steps(episode, space, env.rules)
+    assert low.rewards[-1] == 1.0
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), window_end=st.sampled_from(["timed", "reached"]), dt_min=st.floats(0.0, 4.0))
+def test_both_levels_agree_on_what_was_reached(seed: int, window_end: str, dt_min: float) -> None:
+    env = make(2, seed, limit=25, window_end=window_end, dt_min=dt_min)
+    episodes, _, _ = run(env, 150, seed)
+    for episode in episodes:
+        low = low_level_steps(episode, env.views.subgoals, env.rules)
+        ends = [option.start + option.duration - 1 for option in episode.options]
+        assert [bool(low.rewards[end]) for end in ends] == [option.reached for option in episode.options]
+        cut = [o.reason in (TerminationReason.EPISODE_END, TerminationReason.EVENT) for o in episode.options]
+        assert [bool(low.dones[end]) for end in ends] == [not c for c in cut]
+
+
+def test_sb3s_algorithms_learn_the_low_levels_problem() -> None:
+    env = make(2, 0, goal=5.0, limit=23)
+    PPO("MlpPolicy", env, n_steps=64, n_epochs=1, batch_size=32).learn(256)
+    env.reset()
+    kinds = set()
+    for _ in range(60):
+        _, _, over, infos = env.step(np.zeros((2, 1), np.float32))
+        for index in np.flatnonzero(over):
+            last = infos[index]["terminal_observation"]
+            assert env.observation_space.contains(last)
+            cut = infos[index]["option"]["reason"] == "episode_end"
+            assert infos[index]["TimeLimit.truncated"] == cut
+            kinds.add(cut)
+            assert cut == (last[-1] > 0)  # time was left when it was cut off
+    assert kinds == {True, False}

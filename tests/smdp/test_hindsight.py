@@ -24,11 +24,11 @@ from sb3_tbc.smdp.hindsight import (
 )
 from sb3_tbc.smdp.options import Episode, Option, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
-from sb3_tbc.smdp.views import LevelLayout
+from sb3_tbc.smdp.views import LevelViews
 
 ENV = Corridor()
 RULES = OptionRules(dt_max=4.0, max_options=5)
-LAYOUT = LevelLayout(ENV.subgoals, True)
+LAYOUT = LevelViews(ENV.subgoals, True)
 GOALS = GoalTest(lambda a, d: ENV.compute_reward(a, d, {}), lambda a, d: ENV.compute_terminated(a, d, {}))
 
 

@@ -1,0 +1,80 @@
+"""What makes an environment a goal environment, seen from its spaces. NumPy and Gymnasium only."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
+"""The parts of a goal environment's observation."""
+
+
+def goal_space_problems(observation: spaces.Space[Any], action: spaces.Space[Any] | None = None) -> list[str]:
+    """What keeps a hierarchical agent from acting in an environment with these spaces; empty if nothing.
+
+    :param observation: the environment's observation space
+    :param action: and its action space; None to look at the observations alone
+    :return: one sentence for each problem, "its ..."
+    """
+    found = [] if action is None else _action_problems(action)
+    if not isinstance(observation, spaces.Dict) or any(key not in observation.spaces for key in GOAL_KEYS):
+        keys = sorted(observation.spaces) if isinstance(observation, spaces.Dict) else type(observation).__name__
+        return [*found, f"its observation must be a Dict with the keys {sorted(GOAL_KEYS)}, got {keys}"]
+    for key in GOAL_KEYS:
+        part = observation.spaces[key]
+        if not isinstance(part, spaces.Box) or len(part.shape) != 1:
+            found.append(f"its observation[{key!r}] must be a Box with one dimension, got {part}; flatten it")
+    achieved, desired = observation["achieved_goal"].shape, observation["desired_goal"].shape
+    if achieved != desired:
+        found.append(f"its achieved_goal {achieved} and desired_goal {desired} must have one shape")
+    return found
+
+
+def _action_problems(action: spaces.Space[Any]) -> list[str]:
+    if not isinstance(action, spaces.Box) or len(action.shape) != 1:
+        return [f"its actions must be a Box action space with one dimension, got {action}"]
+    if not np.all(np.isfinite(action.low) & np.isfinite(action.high)):
+        return [f"its action bounds must be finite, got {action}; use gymnasium's RescaleAction or ClipAction"]
+    return []
+
+
+def check_goal_space(observation: spaces.Space[Any], action: spaces.Space[Any] | None = None) -> spaces.Dict:
+    """Return the observation space if it is that of a goal environment.
+
+    :param action: the action space, to look at that too
+    :raises ValueError: naming every problem
+    """
+    problems = goal_space_problems(observation, action)
+    if problems or not isinstance(observation, spaces.Dict):
+        raise ValueError(
+            "a hierarchical agent needs a goal environment with continuous actions, and this is none: "
+            f"{'; '.join(problems)}. Derive it from gymnasium_robotics.core.GoalEnv."
+        )
+    return observation
+
+
+def width(space: spaces.Dict, key: str) -> int:
+    """Number of entries of a part of a goal observation."""
+    return int(np.prod(space.spaces[key].shape or ()))
+
+
+class UnitActions:
+    """Between an action space's own units and coordinates in [-1, 1].
+
+    :param space: the environment's actions, with finite bounds
+    """
+
+    def __init__(self, space: spaces.Box) -> None:
+        self.low, self.width, self.dtype = space.low, space.high - space.low, space.dtype
+        self.centre, self.half = 0.5 * (space.low + space.high), 0.5 * (space.high - space.low)
+
+    def unscale(self, unit: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """The environment's actions for unit ones, of the action space's type; exports round likewise."""
+        actions = self.low + 0.5 * (unit + 1.0) * self.width
+        return np.asarray(actions, dtype=self.dtype)
+
+    def scale(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+        """Unit coordinates of the environment's actions."""
+        return np.asarray((actions - self.centre) / self.half)
