@@ -50,7 +50,7 @@ def _template(name: str) -> str:
 def _low_level(low: MLP | Circuit | Dissipative) -> tuple[str, str]:
     """Data and code."""
     if isinstance(low, Circuit):
-        return _circuit(low), _template("circuit.c")
+        return _circuit(low), _circuit_code(low)
     if isinstance(low, Dissipative):
         return _dissipative(low), _template("dissipative.c")
     return _mlp("low", low), _LOW_MLP
@@ -103,10 +103,18 @@ def _sparse(
     return text + "".join(write(f"{name}_{column}", values[pre, post]) for column, values in columns.items())
 
 
+def _circuit_code(c: Circuit) -> str:
+    """The functions of a circuit: lines between ``@PAPER@`` or ``@LEAN@`` and ``@END@`` belong to that kind alone."""
+    kept, other = ("LEAN", "PAPER") if c.lean else ("PAPER", "LEAN")
+    text = re.sub(rf"@{other}@\n.*?@END@\n", "", _template("circuit.c"), flags=re.DOTALL)
+    return re.sub(rf"@(?:{kept}|END)@\n", "", text)
+
+
 def _circuit(c: Circuit) -> str:
-    n, (inputs, inter) = c.n_neurons, c.current_weight.shape
-    sensory, currents = c.from_inputs[:inputs], c.from_inputs[inputs:]
-    sizes = {"SENSORY": inputs, "INTER": inter, "PRESYNAPTIC": len(c.gain), "SUB_STEPS": c.sub_steps}
+    n, (inputs, driven), s = c.n_neurons, c.current_weight.shape, len(c.sensory_gain)
+    sensory, currents = c.from_inputs[:s], c.from_inputs[s:]
+    sizes = {} if c.lean else {"SENSORY": inputs}
+    sizes |= {"INTER": driven, "PRESYNAPTIC": len(c.gain), "SUB_STEPS": c.sub_steps}
     text = "".join(f"#define TBC_{name} {size}\n" for name, size in sizes.items())
     order = np.concatenate(c.order)
     turn = np.argsort(order)
@@ -114,14 +122,18 @@ def _circuit(c: Circuit) -> str:
     text += f"#define TBC_LOOPS {len(early)}\n" + _indices("heard_early", np.array(early, dtype=int))
     text += _indices("relaxation_order", order)
     input_gain = c.input_gain.astype(np.float64)
-    text += exact("sensory_gain", c.sensory_gain * input_gain) + array("sensory_threshold", c.sensory_threshold)
+    if not c.lean:
+        text += exact("sensory_gain", c.sensory_gain * input_gain) + array("sensory_threshold", c.sensory_threshold)
     text += array("gain", c.gain) + array("threshold", c.threshold)
     text += array("rest_weighted", c.rest[:n]) + array("rest_total", c.rest[n:])
     text += array("capacitance", c.capacitance) + array("current_bias", c.current_bias)
-    text += array("input_conductance", currents[np.arange(inter), np.arange(inter)])
+    text += array("input_conductance", currents[np.arange(driven), np.arange(driven)])
     text += _sparse("current", c.current_weight, {"weight": c.current_weight * input_gain[:, None]}, exact)
-    text += _sparse("sensory", sensory[:, n:], {"weighted": sensory[:, :n], "total": sensory[:, n:]})
-    text += _sparse("recurrent", c.recurrent[:, n:], {"weighted": c.recurrent[:, :n], "total": c.recurrent[:, n:]})
+    columns = {"weighted": c.recurrent[:, :n]}
+    if not c.lean:
+        text += _sparse("sensory", sensory[:, n:], {"weighted": sensory[:, :n], "total": sensory[:, n:]})
+        columns["total"] = c.recurrent[:, n:]
+    text += _sparse("recurrent", c.recurrent[:, n:], columns)
     return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
 
 

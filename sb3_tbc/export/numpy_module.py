@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import base64
 import io
+from dataclasses import replace
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
-from sb3_tbc.export.policy import ExportedPolicy
+from sb3_tbc.export.policy import Circuit, ExportedPolicy
 
 
 def to_numpy_module(policy: ExportedPolicy) -> str:
@@ -17,6 +18,8 @@ def to_numpy_module(policy: ExportedPolicy) -> str:
 
     :param policy: what to export
     """
+    if isinstance(policy.low, Circuit) and policy.low.lean:
+        policy = replace(policy, low=_with_silent_sensory(policy.low))
     arrays: dict[str, Any] = {}
     settings: dict[str, Any] = {}
     for name, value in policy.plain().items():
@@ -41,6 +44,13 @@ def to_numpy_module(policy: ExportedPolicy) -> str:
         "import numpy as np\nfrom numpy.typing import NDArray\n\n"
         f"SETTINGS = {{\n{names}\n}}\nWEIGHTS = (\n{lines}\n)\n\n{runtime}"
     )
+
+
+def _with_silent_sensory(c: Circuit) -> Circuit:
+    """A lean circuit in the paper's form, its sensory synapses of no conductance: one runtime computes both."""
+    silent = np.zeros(len(c.input_gain), np.float32)
+    rows = np.zeros((len(silent), c.from_inputs.shape[1]), np.float32)
+    return replace(c, sensory_gain=silent, sensory_threshold=silent, from_inputs=np.concatenate([rows, c.from_inputs]))
 
 
 def _sort(name: str, value: Any, arrays: dict[str, Any], settings: dict[str, Any]) -> None:

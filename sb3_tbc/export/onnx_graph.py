@@ -137,14 +137,15 @@ def _circuit(g: _Graph, c: Circuit, seen: str, potentials: str) -> str:
         return g("Add", g("MatMul", x, g.constant(weight, wide)), g.constant(shift, wide))
 
     scaled = g("Mul", seen, g.constant(c.input_gain, wide))
-    sensed = _logistic(g, g.affine(scaled, c.sensory_gain, -c.sensory_threshold, wide))
-    current = g("Tanh", product(scaled, c.current_weight, c.current_bias))
-    pace = c.capacitance.astype(wide) * c.sub_steps
-    drive = product(g.join(sensed, current), c.from_inputs, c.rest + np.concatenate([np.zeros(n), pace]))
-    gain, threshold, recurrent, inertia = (g.constant(x, wide) for x in (c.gain, -c.threshold, c.recurrent, pace))
+    heard = [] if c.lean else [_logistic(g, g.affine(scaled, c.sensory_gain, -c.sensory_threshold, wide))]
+    heard.append(g("Tanh", product(scaled, c.current_weight, c.current_bias)))
+    kept = c.capacitance.astype(wide) * c.sub_steps
+    source = g.join(*heard) if len(heard) > 1 else heard[0]
+    constant = product(source, c.from_inputs, c.rest + np.concatenate([np.zeros(n), kept]))
+    gain, threshold, recurrent, inertia = (g.constant(x, wide) for x in (c.gain, -c.threshold, c.recurrent, kept))
     for _ in range(c.sub_steps):
         released = _logistic(g, g("Add", g("Mul", g.slice(potentials, 0, p), gain), threshold))
-        received = g("Add", drive, g("MatMul", released, recurrent))
+        received = g("Add", constant, g("MatMul", released, recurrent))
         weighted = g("Add", g("Mul", potentials, inertia), g.slice(received, 0, n))
         potentials = g("Div", weighted, g.slice(received, n, 2 * n))
     return potentials
@@ -152,10 +153,10 @@ def _circuit(g: _Graph, c: Circuit, seen: str, potentials: str) -> str:
 
 def _dissipative(g: _Graph, c: Dissipative, seen: str, state: str) -> str:
     wide = np.float64
-    drive = g("Add", g("MatMul", seen, g.constant(c.input_weight, wide)), g.constant(c.bias, wide))
+    constant = g("Add", g("MatMul", seen, g.constant(c.input_weight, wide)), g.constant(c.bias, wide))
     recurrent, eta, shrink = (g.constant(x, wide) for x in (c.recurrent, c.eta, c.shrink))
     for _ in range(c.sub_steps):
-        force = g("Tanh", g("Add", drive, g("MatMul", state, recurrent)))
+        force = g("Tanh", g("Add", constant, g("MatMul", state, recurrent)))
         state = g("Mul", g("Add", state, g("Mul", force, eta)), shrink)
     return state
 

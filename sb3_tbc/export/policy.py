@@ -56,16 +56,19 @@ class MLP:
 
 @dataclass(frozen=True)
 class Circuit:
-    """An NDBC circuit with the conductance cell's derived arrays; see :class:`~sb3_tbc.ndbc.cell.ConductanceArrays`."""
+    """An NDBC circuit with the conductance cell's derived arrays; see :class:`~sb3_tbc.ndbc.cell.ConductanceArrays`.
+
+    Lean circuits have no sensory synapses (S = 0), and their reversal potentials are +1 and -1.
+    """
 
     sub_steps: int
     order: tuple[tuple[int, ...], ...]  # in which the closed form takes the neurons, group after group
     input_gain: FloatArray
-    sensory_gain: FloatArray
-    sensory_threshold: FloatArray
+    sensory_gain: FloatArray  # (S,)
+    sensory_threshold: FloatArray  # (S,)
     current_weight: FloatArray  # (I, M)
     current_bias: FloatArray
-    from_inputs: FloatArray  # (I + M, 2 N)
+    from_inputs: FloatArray  # (S + M, 2 N)
     recurrent: FloatArray  # (P, 2 N)
     rest: FloatArray  # (2 N,)
     capacitance: FloatArray
@@ -78,6 +81,11 @@ class Circuit:
     def n_neurons(self) -> int:
         """Neurons with a membrane potential."""
         return len(self.capacitance)
+
+    @property
+    def lean(self) -> bool:
+        """Whether a synapse is one number: its conductance is the size, its reversal potential the sign."""
+        return len(self.sensory_gain) == 0
 
 
 @dataclass(frozen=True)
@@ -230,19 +238,35 @@ def read_circuit(net: NDBCNet, n_actions: int) -> Circuit | Dissipative:
     readout[net.read_from :] = _numpy(net.readout_weight)[:n_actions].T
     if isinstance(cell, DissipativeCell):
         arrays = cell.arrays()
-        eta = cell.pace(arrays, 1.0 / net.sub_steps)
+        eta = cell.step_terms(arrays, 1.0 / net.sub_steps)
         return Dissipative(
-            net.sub_steps, float(eta[0]), _numpy(net.input_gain.unsqueeze(-1) * arrays.input_weight), _numpy(cell.bias),
-            _numpy(cell.enforced(arrays, eta)), _numpy(1.0 / (1.0 + eta * arrays.damping)),
-            readout, _numpy(net.readout_bias)[:n_actions],
-        )  # fmt: skip
+            sub_steps=net.sub_steps,
+            eta=float(eta[0]),
+            input_weight=_numpy(net.input_gain.unsqueeze(-1) * arrays.input_weight),
+            bias=_numpy(cell.bias),
+            recurrent=_numpy(cell.enforced(arrays, eta)),
+            shrink=_numpy(1.0 / (1.0 + eta * arrays.damping)),
+            readout=readout,
+            readout_bias=_numpy(net.readout_bias)[:n_actions],
+        )
     a = cell.arrays()
     return Circuit(
-        net.sub_steps, wiring.relaxation_order(), _numpy(net.input_gain), _numpy(a.sensory_gain),
-        _numpy(cell.sensory_threshold), _numpy(a.current_weight), _numpy(cell.current_bias), _numpy(a.from_inputs),
-        _numpy(a.recurrent), _numpy(a.rest), _numpy(a.capacitance), _numpy(a.gain), _numpy(cell.threshold),
-        readout, _numpy(net.readout_bias)[:n_actions],
-    )  # fmt: skip
+        sub_steps=net.sub_steps,
+        order=wiring.relaxation_order(),
+        input_gain=_numpy(net.input_gain),
+        sensory_gain=_numpy(a.sensory_gain),
+        sensory_threshold=_numpy(cell.sensory_threshold),
+        current_weight=_numpy(a.current_weight),
+        current_bias=_numpy(cell.current_bias),
+        from_inputs=_numpy(a.from_inputs),
+        recurrent=_numpy(a.recurrent),
+        rest=_numpy(a.rest),
+        capacitance=_numpy(a.capacitance),
+        gain=_numpy(a.gain),
+        threshold=_numpy(cell.threshold),
+        readout=readout,
+        readout_bias=_numpy(net.readout_bias)[:n_actions],
+    )
 
 
 def _numpy(tensor: th.Tensor) -> NDArray[np.float32]:

@@ -95,17 +95,17 @@ class CircuitUnits:
         potentials = th.as_tensor(np.where(lesion.wiped, 0.0, state)).double()
         potentials = th.where(held, value, potentials)
         arrays: Any = cell.arrays()
-        pace = cell.pace(arrays, 1.0 / net.sub_steps)
-        drive = cell.drive(seen, arrays, pace)
+        step_terms = cell.step_terms(arrays, 1.0 / net.sub_steps)
+        input_terms = cell.input_terms(seen, arrays, step_terms)
         for _ in range(net.sub_steps):
-            potentials = th.where(held, value, cell.step(potentials, drive, arrays, pace))
+            potentials = th.where(held, value, cell.step(potentials, input_terms, arrays, step_terms))
         heard = th.where(th.as_tensor(lesion.unread), value, potentials)
         activations = potentials.numpy()
         return self._decide(net.read(heard).numpy()), activations.astype(np.float32), activations
 
     def synapses(self) -> list[tuple[str, str, int]]:
-        """Presynaptic and postsynaptic neuron and polarity of every synapse, sensory ones first."""
-        wiring = self.net.wiring
+        """Presynaptic and postsynaptic neuron and present polarity of every synapse, sensory ones first."""
+        wiring = self.net.signed_wiring()
         sensory = [(f"sensory{i}", self.names[j], int(wiring.sensory[i, j])) for i, j in np.argwhere(wiring.sensory)]
         among = [(self.names[i], self.names[j], int(wiring.recurrent[i, j])) for i, j in np.argwhere(wiring.recurrent)]
         return sensory + among
@@ -121,17 +121,8 @@ class CircuitUnits:
                 raw = cell.raw_input_weight if index < n_sensory else cell.raw_weight
                 raw[index if index < n_sensory else index - n_sensory] = -th.inf  # softplus gives zero
             else:
-                cell.raw_conductance[index] = -th.inf
-                self._cut_current(cell, index)
+                cell.cut(index)
         return cut
-
-    def _cut_current(self, cell: Any, index: int) -> None:
-        """A sensory synapse onto an inter neuron has a share in its input current: none of that, either."""
-        wiring = self.net.wiring
-        pairs = np.argwhere(wiring.sensory)
-        if index < len(pairs) and pairs[index, 1] < wiring.inter:
-            flat = int(pairs[index, 0]) * wiring.inter + int(pairs[index, 1])
-            cell.current_weight[cell.current_index == flat] = 0.0
 
 
 class MLPUnits:

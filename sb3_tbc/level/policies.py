@@ -25,6 +25,7 @@ from sb3_tbc.errors import ConfigError
 
 WIRING_KEYS = (
     "inter", "command", "motor", "sensory_fanout", "inter_fanout", "recurrent_command_synapses", "motor_fanin", "seed",
+    "sensory_to",
 )  # fmt: skip
 
 
@@ -313,8 +314,6 @@ class LevelPolicy(SACPolicy):
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
         """Load weights in place, see torch."""
         result = super().load_state_dict(*args, **kwargs)
-        if isinstance(self.actor, NDBCActor):
-            self.actor.net.refresh_step()
         self._weights_changed()
         return result
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 import torch as th
@@ -22,20 +22,44 @@ INITIAL_RANGES = {
 """Initial values are uniform in these."""
 
 
-class ConductanceArrays(NamedTuple):
-    """Everything a step needs, derived once per call (N neurons, I inputs, M inter neurons)."""
+class Cell(Protocol):
+    """What :class:`~sb3_tbc.ndbc.network.NDBCNet` asks of a cell; N neurons.
 
-    current_weight: th.Tensor  # (I, M), input current, on the sensory -> inter mask
-    from_inputs: th.Tensor  # (I + M, 2 N): columns w E | w of sensory synapses and of the input current
+    A control step is ``a = arrays()``, ``s = step_terms(a, dt)``, ``i = input_terms(inputs, a, s)``, and then one
+    ``state = step(state, i, a, s)`` per sub-step.
+    """
+
+    def arrays(self) -> Any:
+        """Masked weights from the current free parameters; differentiable."""
+
+    def step_terms(self, arrays: Any, dt: float | th.Tensor) -> th.Tensor:
+        """What depends on the length ``dt`` of a sub-step, ``(N,)``, or ``(batch, N)`` if ``dt`` is ``(batch, 1)``."""
+
+    def input_terms(self, inputs: th.Tensor, arrays: Any, step_terms: th.Tensor) -> th.Tensor:
+        """What stays constant over the sub-steps of one control step, for scaled inputs ``(..., n_inputs)``."""
+
+    def step(self, state: th.Tensor, input_terms: th.Tensor, arrays: Any, step_terms: th.Tensor) -> th.Tensor:
+        """The state ``(batch, N)`` one sub-step later."""
+
+
+class ConductanceArrays(NamedTuple):
+    """Everything a step needs, derived once per call.
+
+    N neurons, I inputs, S sensory neurons with synapses of their own (all I in the paper's form, none of lean ones),
+    M neurons with an input current, P neurons that others hear.
+    """
+
+    current_weight: th.Tensor  # (I, M), input current, on the mask of the sensory neurons' targets
+    from_inputs: th.Tensor  # (S + M, 2 N): columns w E | w of sensory synapses and of the input current
     recurrent: th.Tensor  # (P, 2 N): columns w E | w of the synapses among neurons, P presynaptic ones
     rest: th.Tensor  # (2 N,): g_l V_leak | g_l + g_in
     capacitance: th.Tensor  # (N,)
     gain: th.Tensor  # (P,), steepness of the presynaptic logistic
-    sensory_gain: th.Tensor  # (I,)
+    sensory_gain: th.Tensor  # (S,)
 
 
 class ConductanceValues(NamedTuple):
-    """The positive quantities of the cell, one per synapse (sensory ones first), inter neuron, neuron or input."""
+    """The positive quantities of the cell: per synapse (sensory ones first), neuron with a current, neuron or input."""
 
     conductance: th.Tensor
     reversal: th.Tensor  # |E|; the sign is the synapse's polarity
@@ -56,6 +80,11 @@ def uniform(size: int, low: float, high: float, generator: th.Generator | None) 
     return low + (high - low) * th.rand(size, generator=generator)
 
 
+def positive_parameter(size: int, name: str, generator: th.Generator | None) -> nn.Parameter:
+    """Free parameters whose softplus is uniform in the range that :data:`INITIAL_RANGES` gives to ``name``."""
+    return nn.Parameter(inverse_softplus(uniform(size, *INITIAL_RANGES[name], generator)))
+
+
 class ConductanceCell(nn.Module):
     """Membrane potentials ``C dV/dt = g_l (V_leak - V) + sum_j w_ij sigma(V_j) (E_ij - V) + g_in (tanh(W u + b) - V)``.
 
@@ -70,41 +99,48 @@ class ConductanceCell(nn.Module):
 
     def __init__(self, wiring: NDBCWiring, generator: th.Generator | None = None) -> None:
         super().__init__()
-        self.n_inputs, self.n_inter, self.n_neurons = wiring.n_inputs, wiring.inter, wiring.n_neurons
+        self.n_inputs, self.n_driven, self.n_neurons = wiring.n_inputs, wiring.n_driven, wiring.n_neurons
         self.n_presynaptic = int(np.flatnonzero(wiring.recurrent.any(axis=1)).max(initial=0)) + 1
-        self._index_synapses(wiring)
-        n, m, inputs = self.n_neurons, self.n_inter, self.n_inputs
-
-        def positive(size: int, name: str) -> nn.Parameter:
-            return nn.Parameter(inverse_softplus(uniform(size, *INITIAL_RANGES[name], generator)))
-
-        self.raw_conductance = positive(len(self.polarity), "conductance")
-        self.raw_reversal = positive(len(self.polarity), "reversal")
-        self.raw_input_conductance = positive(m, "input_conductance")
-        self.raw_capacitance = positive(n, "capacitance")
-        self.raw_leak = positive(n, "leak")
-        self.raw_gain = positive(self.n_presynaptic, "gain")
-        self.raw_sensory_gain = positive(inputs, "gain")
-        self.leak_potential = nn.Parameter(uniform(n, -0.1, 0.1, generator))
-        self.threshold = nn.Parameter(uniform(self.n_presynaptic, -0.5, 0.5, generator))
-        self.sensory_threshold = nn.Parameter(uniform(inputs, -0.5, 0.5, generator))
-        spread = 2.0 / max(1.0, len(self.current_index) / m) ** 0.5
-        self.current_weight = nn.Parameter(uniform(len(self.current_index), -spread, spread, generator))
-        self.current_bias = nn.Parameter(uniform(m, -0.3, 0.3, generator))
-
-    def _index_synapses(self, wiring: NDBCWiring) -> None:
-        """Where each synapse's ``w E`` and ``w`` go in one flat matrix with rows sensory | input current | neurons."""
-        n, m, inputs = self.n_neurons, self.n_inter, self.n_inputs
-        pre_s, post_s = np.nonzero(wiring.sensory)
-        pre_r, post_r = np.nonzero(wiring.recurrent)
-        rows = np.concatenate([pre_s, inputs + m + pre_r])
-        reversal_at = rows * 2 * n + np.concatenate([post_s, post_r])
-        current_at = (inputs + np.arange(m)) * 2 * n + np.arange(m)
-        polarity = np.concatenate([wiring.sensory[pre_s, post_s], wiring.recurrent[pre_r, post_r]])
-        pre_c, post_c = np.nonzero(wiring.sensory[:, wiring.layer("inter")])
         self.polarity: th.Tensor
         self.matrix_index: th.Tensor
         self.current_index: th.Tensor
+        self._index_synapses(wiring)
+        self._draw_parameters(generator)
+
+    @property
+    def n_sensory_synapsing(self) -> int:
+        """Sensory neurons that have synapses besides the input current: all of them, or none where they are lean."""
+        return self.n_inputs
+
+    def _draw_parameters(self, generator: th.Generator | None) -> None:
+        n, m, inputs = self.n_neurons, self.n_driven, self.n_inputs
+        self.raw_conductance = positive_parameter(len(self.polarity), "conductance", generator)
+        self.raw_reversal = positive_parameter(len(self.polarity), "reversal", generator)
+        self.raw_input_conductance = positive_parameter(m, "input_conductance", generator)
+        self.raw_capacitance = positive_parameter(n, "capacitance", generator)
+        self.raw_leak = positive_parameter(n, "leak", generator)
+        self.raw_gain = positive_parameter(self.n_presynaptic, "gain", generator)
+        self.raw_sensory_gain = positive_parameter(inputs, "gain", generator)
+        self.leak_potential = nn.Parameter(uniform(n, -0.1, 0.1, generator))
+        self.threshold = nn.Parameter(uniform(self.n_presynaptic, -0.5, 0.5, generator))
+        self.sensory_threshold = nn.Parameter(uniform(inputs, -0.5, 0.5, generator))
+        self._draw_current(generator)
+
+    def _draw_current(self, generator: th.Generator | None) -> None:
+        spread = 2.0 / max(1.0, len(self.current_index) / self.n_driven) ** 0.5
+        self.current_weight = nn.Parameter(uniform(len(self.current_index), -spread, spread, generator))
+        self.current_bias = nn.Parameter(uniform(self.n_driven, -0.3, 0.3, generator))
+
+    def _index_synapses(self, wiring: NDBCWiring) -> None:
+        """Where each synapse's ``w E`` and ``w`` go in one flat matrix with rows sensory | input current | neurons."""
+        n, m, s = self.n_neurons, self.n_driven, self.n_sensory_synapsing
+        pre_s, post_s = np.nonzero(wiring.sensory[:s])
+        pre_r, post_r = np.nonzero(wiring.recurrent)
+        rows = np.concatenate([pre_s, s + m + pre_r])
+        reversal_at = rows * 2 * n + np.concatenate([post_s, post_r])
+        current_at = (s + np.arange(m)) * 2 * n + np.arange(m)
+        polarity = np.concatenate([wiring.sensory[pre_s, post_s], wiring.recurrent[pre_r, post_r]])
+        pre_c, post_c = np.nonzero(wiring.sensory[:, :m])
         self.register_buffer("polarity", th.as_tensor(polarity.astype(np.float32)))
         self.register_buffer("matrix_index", th.as_tensor(np.concatenate([reversal_at, reversal_at + n, current_at])))
         self.register_buffer("current_index", th.as_tensor(pre_c * m + post_c))
@@ -120,49 +156,79 @@ class ConductanceCell(nn.Module):
         raw += [self.raw_leak, self.raw_gain, self.raw_sensory_gain]
         return ConductanceValues(*th.split(functional.softplus(th.cat(raw)), [len(r) for r in raw]))
 
+    def reversal(self, value: ConductanceValues) -> th.Tensor:
+        """Signed reversal potentials, one per synapse; differentiable."""
+        return value.reversal * self.polarity
+
     def arrays(self) -> ConductanceArrays:
         """Masked conductances from the current free parameters; differentiable."""
-        n, m, inputs = self.n_neurons, self.n_inter, self.n_inputs
         value = self.values()
-        entries = (value.conductance * value.reversal * self.polarity, value.conductance, value.input_conductance)
+        return self._assemble(value, value.conductance * value.reversal * self.polarity)
+
+    def _assemble(self, value: ConductanceValues, weighted: th.Tensor) -> ConductanceArrays:
+        """The arrays for positive quantities and each synapse's ``w E``."""
+        n, m, inputs = self.n_neurons, self.n_driven, self.n_inputs
         zeros = self.raw_leak.new_zeros
-        rows = [inputs + m, self.n_presynaptic]
-        flat = zeros(sum(rows) * 2 * n).scatter(0, self.matrix_index, th.cat(entries))
+        rows = [self.n_sensory_synapsing + m, self.n_presynaptic]
+        entries = th.cat((weighted, value.conductance, value.input_conductance))
+        flat = zeros(sum(rows) * 2 * n).scatter(0, self.matrix_index, entries)
         from_inputs, recurrent = th.split(flat.view(sum(rows), 2 * n), rows)
         current = zeros(inputs * m).scatter(0, self.current_index, self.current_weight).view(inputs, m)
         total = value.leak + functional.pad(value.input_conductance, (0, n - m))
-        rest = th.cat([value.leak * self.leak_potential, total])
-        return ConductanceArrays(current, from_inputs, recurrent, rest, *value[3:4], *value[5:])
+        return ConductanceArrays(
+            current_weight=current,
+            from_inputs=from_inputs,
+            recurrent=recurrent,
+            rest=th.cat([value.leak * self.leak_potential, total]),
+            capacitance=value.capacitance,
+            gain=value.gain,
+            sensory_gain=value.sensory_gain,
+        )
 
-    def pace(self, arrays: ConductanceArrays, dt: float | th.Tensor) -> th.Tensor:
+    def excitation(self, arrays: ConductanceArrays) -> tuple[th.Tensor, th.Tensor]:
+        """Weights ``(n_inputs, S + M)`` and shifts ``(S + M,)`` whose tanh is all that inputs do.
+
+        The logistic of sensory neurons is ``(1 + tanh(x / 2)) / 2``: here x is halved, and who uses this halves the
+        sensory rows of ``from_inputs`` and adds half of their sum to ``rest``.
+        """
+        weight = th.cat((th.diag(0.5 * arrays.sensory_gain), arrays.current_weight), dim=1)
+        return weight, th.cat((-0.5 * self.sensory_threshold, self.current_bias))
+
+    def step_terms(self, arrays: ConductanceArrays, dt: float | th.Tensor) -> th.Tensor:
         """``C / dt``, the inertia of each potential, ``(N,)``, or ``(batch, N)`` if ``dt`` is ``(batch, 1)``."""
         return arrays.capacitance / dt
 
-    def drive(self, inputs: th.Tensor, arrays: ConductanceArrays, pace: th.Tensor) -> th.Tensor:
+    def input_terms(self, inputs: th.Tensor, arrays: ConductanceArrays, step_terms: th.Tensor) -> th.Tensor:
         """What stays constant over the sub-steps of one control step.
 
         :param inputs: scaled inputs, ``(..., n_inputs)``
         :param arrays: from :meth:`arrays`
-        :param pace: from :meth:`pace`
+        :param step_terms: from :meth:`step_terms`
         :return: ``(..., 2 n_neurons)``: sum of conductance x potential | sum of conductances + C / dt
         """
+        constant = arrays.rest + functional.pad(step_terms, (self.n_neurons, 0))
+        return self.heard_inputs(inputs, arrays) @ arrays.from_inputs + constant
+
+    def heard_inputs(self, inputs: th.Tensor, arrays: ConductanceArrays) -> th.Tensor:
+        """What sensory neurons release, and the potentials the input currents pull towards, ``(..., S + M)``."""
         sensed = th.sigmoid(inputs * arrays.sensory_gain - self.sensory_threshold)
         current = th.tanh(inputs @ arrays.current_weight + self.current_bias)
-        constant = arrays.rest + functional.pad(pace, (self.n_neurons, 0))
-        return th.cat([sensed, current], dim=-1) @ arrays.from_inputs + constant
+        return th.cat([sensed, current], dim=-1)
 
-    def step(self, state: th.Tensor, drive: th.Tensor, arrays: ConductanceArrays, pace: th.Tensor) -> th.Tensor:
+    def step(
+        self, state: th.Tensor, input_terms: th.Tensor, arrays: ConductanceArrays, step_terms: th.Tensor
+    ) -> th.Tensor:
         """One semi-implicit Euler sub-step: a convex combination of V, V_leak, the reversal potentials and the current.
 
         :param state: potentials V, ``(batch, n_neurons)``
-        :param drive: from :meth:`drive`
+        :param input_terms: from :meth:`input_terms`
         :param arrays: from :meth:`arrays`
-        :param pace: from :meth:`pace`
+        :param step_terms: from :meth:`step_terms`
         :return: the potentials one sub-step later
         """
         released = th.sigmoid(state[:, : self.n_presynaptic] * arrays.gain - self.threshold)
-        weighted, total = (drive + released @ arrays.recurrent).chunk(2, dim=-1)
-        return (state * pace + weighted) / total
+        weighted, total = (input_terms + released @ arrays.recurrent).chunk(2, dim=-1)
+        return (state * step_terms + weighted) / total
 
     @th.no_grad()
     def bounds(self, state_low: float = 0.0, state_high: float = 0.0) -> tuple[th.Tensor, th.Tensor]:
@@ -172,11 +238,20 @@ class ConductanceCell(nn.Module):
         :param state_high: upper bound of the starting potentials
         :return: lower and upper bounds, each ``(n_neurons,)``
         """
-        n, m = self.n_neurons, self.n_inter
-        value = self.values()
-        post = self.matrix_index[: len(self.polarity)] % (2 * n)
-        reversal = value.reversal * self.polarity
+        n, m = self.n_neurons, self.n_driven
+        reversal = self.reversal(self.values())
+        post = self.matrix_index[: len(reversal)] % (2 * n)
         low = self.leak_potential.clamp(max=state_low).scatter_reduce(0, post, reversal, "amin")
         high = self.leak_potential.clamp(min=state_high).scatter_reduce(0, post, reversal, "amax")
         low[:m], high[:m] = low[:m].clamp(max=-1.0), high[:m].clamp(min=1.0)  # the input current pulls towards a tanh
         return low, high
+
+    @th.no_grad()
+    def cut(self, synapse: int) -> None:
+        """Let a synapse conduct nothing; a sensory one also loses its share in the input current.
+
+        :param synapse: its number, sensory ones first, each kind in the order of presynaptic, then postsynaptic neuron
+        """
+        self.raw_conductance[synapse] = -th.inf  # softplus gives zero
+        if synapse < len(self.current_weight):
+            self.current_weight[synapse] = 0.0

@@ -85,13 +85,13 @@ class ClosedFormNDBC:
         read = potentials[:, self.net.read_from :]
         return read @ self.values["readout_weight"].T + self.values["readout_bias"], potentials
 
-    def _drive(self, inputs: FloatArray) -> FloatArray:
+    def _input_terms(self, inputs: FloatArray) -> FloatArray:
         v = self.values
         scaled = inputs * v["input_gain"]
-        sensed = _logistic(scaled * v["sensory_gain"] - v["sensory_threshold"])
+        sensed = _logistic(scaled[:, : self.cell.n_sensory_synapsing] * v["sensory_gain"] - v["sensory_threshold"])
         current = np.tanh(scaled @ v["current_weight"] + v["current_bias"])
-        drive: FloatArray = np.concatenate((sensed, current), axis=1) @ v["from_inputs"] + v["rest"]
-        return drive
+        terms: FloatArray = np.concatenate((sensed, current), axis=1) @ v["from_inputs"] + v["rest"]
+        return terms
 
     def _released(self, potentials: FloatArray) -> FloatArray:
         gain = self.values["gain"]
@@ -99,15 +99,15 @@ class ClosedFormNDBC:
 
     def _relax(self, inputs: FloatArray, state: FloatArray, duration: float) -> Relaxation:
         """What every neuron relaxes to and how fast, later groups hearing where earlier ones are after ``duration``."""
-        n, drive = self.net.state_dim, self._drive(inputs)
+        n, terms = self.net.state_dim, self._input_terms(inputs)
         start = np.asarray(state, dtype=self.dtype)
         potentials, target, total = start.copy(), np.empty_like(start), np.empty_like(start)
         heard = []
         for group, columns in zip(self.groups, self._columns, strict=True):
             heard.append(self._released(potentials))
             weighted, conductance = np.split(heard[-1] @ columns, 2, axis=1)
-            total[:, group] = conductance + drive[:, group + n]
-            target[:, group] = (weighted + drive[:, group]) / total[:, group]
+            total[:, group] = conductance + terms[:, group + n]
+            target[:, group] = (weighted + terms[:, group]) / total[:, group]
             share = -np.expm1(-total[:, group] * duration / self.values["capacitance"][group])
             potentials[:, group] += (target[:, group] - start[:, group]) * share
         return Relaxation(start, target, total / self.values["capacitance"], total, tuple(heard))

@@ -93,27 +93,29 @@ class DissipativeCell(nn.Module):
         input_weight = zeros(self.n_inputs * n).scatter(0, self.input_index, drawn).view(self.n_inputs, n)
         return DissipativeArrays(input_weight, recurrent, damping)
 
-    def pace(self, arrays: DissipativeArrays, dt: float | th.Tensor) -> th.Tensor:
+    def step_terms(self, arrays: DissipativeArrays, dt: float | th.Tensor) -> th.Tensor:
         """``eta``, broadcast to ``(N,)`` or ``(batch, N)``."""
         return th.ones_like(arrays.damping) * dt
 
-    def drive(self, inputs: th.Tensor, arrays: DissipativeArrays, pace: th.Tensor) -> th.Tensor:
+    def input_terms(self, inputs: th.Tensor, arrays: DissipativeArrays, step_terms: th.Tensor) -> th.Tensor:
         """``W u + b``, constant over the sub-steps of one control step, ``(..., n_neurons)``."""
         return inputs @ arrays.input_weight + self.bias
 
-    def step(self, state: th.Tensor, drive: th.Tensor, arrays: DissipativeArrays, pace: th.Tensor) -> th.Tensor:
+    def step(
+        self, state: th.Tensor, input_terms: th.Tensor, arrays: DissipativeArrays, step_terms: th.Tensor
+    ) -> th.Tensor:
         """One sub-step of equation 20 for states ``(batch, n_neurons)``."""
-        recurrent = self.enforced(arrays, pace)
-        return (state + pace * th.tanh(drive + state @ recurrent)) / (1.0 + pace * arrays.damping)
+        recurrent = self.enforced(arrays, step_terms)
+        return (state + step_terms * th.tanh(input_terms + state @ recurrent)) / (1.0 + step_terms * arrays.damping)
 
-    def enforced(self, arrays: DissipativeArrays, pace: th.Tensor) -> th.Tensor:
+    def enforced(self, arrays: DissipativeArrays, step_terms: th.Tensor) -> th.Tensor:
         """U, scaled down so that rho <= max_rho: ``||U|| <= (max_rho / ||(I + eta K)^-1|| - 1) / eta``.
 
         ``sqrt(||U||_1 ||U||_inf)`` stands for the spectral norm: never smaller, and cheap and differentiable.
         """
         if self.max_rho is None:
             return arrays.recurrent
-        eta = pace.max()
+        eta = step_terms.max()
         room = (self.max_rho * (1.0 + eta * arrays.damping.min()) - 1.0).clamp(min=0.0) / eta
         size = arrays.recurrent.abs()
         norm = (size.sum(dim=0).max() * size.sum(dim=1).max()).sqrt()
@@ -123,9 +125,9 @@ class DissipativeCell(nn.Module):
     def certificate(self, dt: float) -> Certificate:
         """The certificate of equation 21 for sub-steps of length ``dt``, from the exact spectral norms."""
         arrays = self.arrays()
-        pace = self.pace(arrays, dt)
+        step_terms = self.step_terms(arrays, dt)
         shrink = float(1.0 / (1.0 + dt * arrays.damping.min()))
-        recurrent_norm = float(th.linalg.matrix_norm(self.enforced(arrays, pace).double(), 2))
+        recurrent_norm = float(th.linalg.matrix_norm(self.enforced(arrays, step_terms).double(), 2))
         input_norm = float(th.linalg.matrix_norm(arrays.input_weight.double(), 2))
         rho = shrink * (1.0 + dt * recurrent_norm)
         return Certificate(rho, shrink * dt * input_norm, shrink * dt * float(self.bias.norm()))

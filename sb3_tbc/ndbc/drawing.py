@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from sb3_tbc.extras import require
-from sb3_tbc.ndbc.wiring import LAYERS
-
-if TYPE_CHECKING:
-    from sb3_tbc.ndbc.wiring import NDBCWiring
+from sb3_tbc.ndbc.wiring import LAYERS, NDBCWiring
 
 COLOURS = {"sensory": "#4d9221", "inter": "#7b7b7b", "command": "#c27ba0", "motor": "#e08214"}
 EXCITATORY, INHIBITORY = "#c0392b", "#2c5aa0"

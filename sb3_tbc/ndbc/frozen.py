@@ -49,13 +49,19 @@ class FrozenNDBC:
             self._read_dissipative(net.cell)
 
     def _read_conductance(self, cell: ConductanceCell) -> None:
-        """The logistic is ``(1 + tanh(x / 2)) / 2``, one call instead of four; the halves go into the matrices.
+        """Fold all that does not change between updates into four matrices, so that a sub-step is four NumPy calls.
 
-        A sub-step works on ``[x / 2 | V]``, presynaptic arguments and all potentials: both come out of one product and
-        one quotient, ``[gain w - threshold g | w] / [g | g]``, for numerators w and denominators g of the potentials.
+        With ``sigma(x) = (1 + tanh(x / 2)) / 2`` inputs and neurons need one tanh each; the halves go into the matrices
+        and their constant part into ``rest``. The conductance equation's sub-step (paper, section 4.3)
+
+            V <- (C/dt V + sum_j g_ij sigma_j E_ij + ...) / (C/dt + sum_j g_ij sigma_j + ...)
+
+        then has numerator and denominator that are linear in ``[tanh | V]``. A sub-step works on ``[x / 2 | V]``,
+        presynaptic arguments and all potentials: both come out of one product and one quotient,
+        ``[gain w - threshold g | w] / [g | g]``, for numerators w and denominators g of the potentials.
         """
         arrays = type(cell.arrays())(*(tensor.double() for tensor in cell.arrays()))
-        inertia = cell.pace(arrays, 1.0 / self._sub_steps)
+        inertia = cell.step_terms(arrays, 1.0 / self._sub_steps)
         gain, threshold = 0.5 * arrays.gain, 0.5 * cell.threshold.double()
 
         def widened(matrix: th.Tensor) -> FloatArray:
@@ -64,11 +70,10 @@ class FrozenNDBC:
             arguments = weighted[..., : len(gain)] * gain - heard * threshold
             return _numpy(th.cat([arguments, weighted, heard, total], dim=-1))
 
-        sensory, current = th.split(arrays.from_inputs, [cell.n_inputs, cell.n_inter])
+        sensory, current = th.split(arrays.from_inputs, [cell.n_sensory_synapsing, cell.n_driven])
         half_sums = 0.5 * (sensory.sum(dim=0) + arrays.recurrent.sum(dim=0))
-        excite = th.cat([th.diag(0.5 * arrays.sensory_gain), arrays.current_weight], dim=1)
-        self._excite = _numpy(self.net.input_gain.unsqueeze(-1) * excite)
-        self._excite_bias = _numpy(th.cat([-0.5 * cell.sensory_threshold, cell.current_bias]))
+        excite, shift = cell.excitation(arrays)
+        self._excite, self._excite_bias = _numpy(self.net.input_gain.unsqueeze(-1) * excite), _numpy(shift)
         self._from_inputs = widened(th.cat([0.5 * sensory, current]))
         self._rest = widened(arrays.rest + half_sums + functional.pad(inertia, (self.state_dim, 0)))
         kept = functional.pad(th.diag(inertia), (0, self.state_dim))
@@ -77,7 +82,7 @@ class FrozenNDBC:
 
     def _read_dissipative(self, cell: DissipativeCell) -> None:
         arrays = cell.arrays()
-        eta = cell.pace(arrays, 1.0 / self._sub_steps)
+        eta = cell.step_terms(arrays, 1.0 / self._sub_steps)
         self._excite, self._excite_bias = (
             _numpy(self.net.input_gain.unsqueeze(-1) * arrays.input_weight),
             _numpy(cell.bias),
@@ -102,9 +107,9 @@ class FrozenNDBC:
         presynaptic, recurrent = len(self._gain), self._recurrent
         excited = inputs.astype(np.float64).dot(self._excite)
         excited += self._excite_bias
-        drive = np.tanh(excited, excited).dot(self._from_inputs)
-        drive += self._rest
-        now, total = np.empty((len(state), len(recurrent))), np.empty_like(drive)
+        constant = np.tanh(excited, excited).dot(self._from_inputs)
+        constant += self._rest
+        now, total = np.empty((len(state), len(recurrent))), np.empty_like(constant)
         arguments, potentials = now[:, :presynaptic], now[:, presynaptic:]
         numerators, denominators = total[:, : len(recurrent)], total[:, len(recurrent) :]
         potentials[...] = state
@@ -113,16 +118,16 @@ class FrozenNDBC:
         for _ in range(self._sub_steps):
             np.tanh(arguments, arguments)
             now.dot(recurrent, total)
-            total += drive
+            total += constant
             np.divide(numerators, denominators, now)
         return potentials
 
     def _advance_dissipative(self, inputs: FloatArray, state: FloatArray) -> FloatArray:
-        drive = inputs.dot(self._excite)
-        drive += self._excite_bias
+        constant = inputs.dot(self._excite)
+        constant += self._excite_bias
         for _ in range(self._sub_steps):
             force = state.dot(self._recurrent)
-            force += drive
+            force += constant
             np.tanh(force, out=force)
             force *= self._gain
             force += state

@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral
 from typing import Any
 
 import torch as th
 from torch import nn
 from torch.nn import functional
 
-from sb3_tbc.ndbc.cell import ConductanceCell
+from sb3_tbc.ndbc.cell import Cell, ConductanceCell
 from sb3_tbc.ndbc.dissipative import Certificate, DissipativeCell
+from sb3_tbc.ndbc.lean import LeanCell
 from sb3_tbc.ndbc.sequence import Unrolled, unroll
 from sb3_tbc.ndbc.stepping import LipschitzProxy, StepRule, advance_checked
 from sb3_tbc.ndbc.wiring import NDBCWiring
 
 DYNAMICS = ("conductance", "dissipative")
+SYNAPSES = ("paper", "lean")
+STEP_STATE, STEP_DIRECTION = "step_state", "step_direction"
+"""Entries of the state where K follows a step-size rule."""
 
 
 class NDBCNet(nn.Module):
@@ -35,7 +40,14 @@ class NDBCNet(nn.Module):
     :param adaptive_step: choose K by the step-size rule: True, or the fields of :class:`StepRule` that differ from
         their defaults; K then changes only in :meth:`after_update` and :meth:`refresh_step`, never inside a call
     :param seed: seed of the initial values; by default torch's global stream
+    :param synapses: ``"paper"``: a conductance and a reversal potential per synapse, sensory ones included; ``"lean"``:
+        one parameter per synapse, and inputs act through the input current alone, see
+        :class:`~sb3_tbc.ndbc.lean.LeanCell`; conductance dynamics only
     :raises ValueError: if sizes do not fit together or an option is unknown
+
+    Derivatives of any order and ``torch.func`` (``vmap``, ``jacrev``) work on single steps; sequences have first
+    derivatives only and refuse the rest. ``torch.jit.script`` does not take the network: use ``torch.compile`` or the
+    exports.
     """
 
     def __init__(
@@ -50,23 +62,25 @@ class NDBCNet(nn.Module):
         max_rho: float | None = None,
         adaptive_step: bool | Mapping[str, Any] = False,
         seed: int | None = None,
+        synapses: str = "paper",
     ) -> None:
         super().__init__()
         wiring = wiring if isinstance(wiring, NDBCWiring) else NDBCWiring.from_dict(wiring)
-        _check_options(n_inputs, n_outputs, wiring, sub_steps, dynamics, readout, max_rho)
+        _check_sizes(n_inputs, n_outputs, wiring, sub_steps)
+        _check_options(dynamics, readout, max_rho, synapses)
         scale = th.ones(n_inputs) if input_scale is None else th.as_tensor(input_scale, dtype=th.float32).clone()
         if scale.shape != (n_inputs,) or not bool((scale > 0).all()):
             raise ValueError(f"input_scale must be {n_inputs} positive numbers, got {input_scale}")
         generator = None if seed is None else th.Generator().manual_seed(seed)
         self.n_inputs, self.n_outputs, self.sub_steps, self.wiring = n_inputs, n_outputs, int(sub_steps), wiring
-        self.dynamics, self.readout = dynamics, readout
+        self.dynamics, self.readout, self.synapses = dynamics, readout, synapses
         self.input_gain: th.Tensor
         self.register_buffer("input_gain", 1.0 / scale)
-        self.cell: ConductanceCell | DissipativeCell = (
-            ConductanceCell(wiring, generator)
-            if dynamics == "conductance"
-            else DissipativeCell(wiring, generator, max_rho=max_rho)
-        )
+        self.cell: ConductanceCell | DissipativeCell
+        if dynamics == "dissipative":
+            self.cell = DissipativeCell(wiring, generator, max_rho=max_rho)
+        else:
+            self.cell = (LeanCell if synapses == "lean" else ConductanceCell)(wiring, generator)
         self._check_enforceable(max_rho)
         self.read_from = wiring.layer("motor").start if readout == "motor" else 0
         n_read = wiring.n_neurons - self.read_from
@@ -74,6 +88,8 @@ class NDBCNet(nn.Module):
         self.readout_weight = nn.Parameter(drawn / n_read**0.5)
         self.readout_bias = nn.Parameter(th.zeros(n_outputs))
         self.lipschitz = LipschitzProxy(self.state_dim)
+        self._restore_step: tuple[list[int], th.Tensor] | None = None
+        self.register_load_state_dict_post_hook(_after_loading)  # type: ignore[no-untyped-call]
         self.step_rule = (
             None if adaptive_step is False else StepRule(**({} if adaptive_step is True else adaptive_step))
         )
@@ -117,10 +133,12 @@ class NDBCNet(nn.Module):
 
         :param inputs: ``(batch, n_inputs)`` for one step or ``(batch, time, n_inputs)`` for a sequence
         :param state: potentials to start from, ``(batch, state_dim)``; by default zero
-        :param mask: 0 where the potentials are reset *before* the step, else 1; ``(batch,)`` or ``(batch, time)``
-        :param interval: length of the step in control steps where it is not 1, ``(batch,)`` or ``(batch, time)``
+        :param mask: 0 where the potentials are reset *before* the step, whatever they were, else 1; ``(batch,)`` or
+            ``(batch, time)``
+        :param interval: length of the step in control steps where it is not 1, ``(batch,)`` or ``(batch, time)``;
+            0 leaves the potentials as they are
         :return: outputs ``(batch, n_outputs)`` or ``(batch, time, n_outputs)``, and the final potentials
-        :raises ValueError: if a shape does not fit
+        :raises ValueError: if a shape does not fit or an interval is negative
         """
         if inputs.dim() == 2:
             state = self._advance(inputs, state, mask, interval)
@@ -130,6 +148,8 @@ class NDBCNet(nn.Module):
             weight = functional.pad(self.readout_weight, (self.read_from, 0))
             return fast.read(weight, self.readout_bias), fast.last()
         trace = self.unroll(inputs, state, mask, interval)
+        if inputs.shape[1] == 0:
+            return self.read(trace), self.initial_state(len(inputs)) if state is None else state
         return self.read(trace), trace[:, -1]
 
     def read(self, state: th.Tensor) -> th.Tensor:
@@ -153,7 +173,7 @@ class NDBCNet(nn.Module):
             mask_t, interval_t = (None if x is None else x[:, t] for x in (mask, interval))
             state = self._advance(inputs[:, t], state, mask_t, interval_t)
             trace.append(state)
-        return th.stack(trace, dim=1)
+        return th.stack(trace, dim=1) if trace else state.unsqueeze(1)[:, :0]
 
     def _unroll_fast(
         self, inputs: th.Tensor, state: th.Tensor | None, mask: th.Tensor | None, interval: th.Tensor | None
@@ -161,7 +181,7 @@ class NDBCNet(nn.Module):
         """A sequence through the node of its own; None for what that cannot do."""
         self._check_shapes(inputs, state, mask, interval, dims=3)
         checked = self.step_rule is not None and self.step_rule.half_step_check
-        if not isinstance(self.cell, ConductanceCell) or interval is not None or checked:
+        if not isinstance(self.cell, ConductanceCell) or interval is not None or checked or inputs.shape[1] == 0:
             return None
         state = self.initial_state(inputs.shape[0]) if state is None else state
         return unroll(self.cell, inputs, self.input_gain, state, mask, self.sub_steps)
@@ -172,16 +192,26 @@ class NDBCNet(nn.Module):
         """The potentials one control step later; plain tensor operations, so any tracer can follow."""
         self._check_shapes(inputs, state, mask, interval, dims=2)
         state = self.initial_state(inputs.shape[0]) if state is None else state
-        state = state if mask is None else state * mask.unsqueeze(-1)
-        cell: Any = self.cell
+        # A product with the mask would keep a state that is NaN.
+        state = state if mask is None else th.where(mask.unsqueeze(-1) != 0, state, 0.0)
+        if interval is None:
+            return self._advance_by(inputs, state, None)
+        _check_intervals(interval)
+        passes = interval.unsqueeze(-1) > 0
+        later = self._advance_by(inputs, state, th.where(passes, interval.unsqueeze(-1), 1.0))
+        return th.where(passes, later, state)  # where no time passes, C / dt is infinite
+
+    def _advance_by(self, inputs: th.Tensor, state: th.Tensor, length: th.Tensor | None) -> th.Tensor:
+        """The potentials after control steps of ``length``, ``(batch, 1)``; None for 1."""
+        cell: Cell = self.cell
         if self.step_rule is not None and self.step_rule.half_step_check:
-            length = state.new_ones(len(state), 1) if interval is None else interval.unsqueeze(-1)
+            length = state.new_ones(len(state), 1) if length is None else length
             return advance_checked(cell, inputs * self.input_gain, state, length, self.sub_steps, self.step_rule)
         arrays = cell.arrays()
-        pace = cell.pace(arrays, 1.0 / self.sub_steps if interval is None else interval.unsqueeze(-1) / self.sub_steps)
-        drive = cell.drive(inputs * self.input_gain, arrays, pace)
+        step_terms = cell.step_terms(arrays, (1.0 if length is None else length) / self.sub_steps)
+        input_terms = cell.input_terms(inputs * self.input_gain, arrays, step_terms)
         for _ in range(self.sub_steps):
-            state = cell.step(state, drive, arrays, pace)
+            state = cell.step(state, input_terms, arrays, step_terms)
         return state
 
     def _check_shapes(
@@ -195,6 +225,44 @@ class NDBCNet(nn.Module):
         for name, value in (("mask", mask), ("interval", interval)):
             if value is not None and tuple(value.shape) != lead:
                 raise ValueError(f"{name} must have one entry per step, shape {lead}, got {tuple(value.shape)}")
+
+    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+        """With a step-size rule, also K, the updates since it was chosen, and where the power iteration stands."""
+        super()._save_to_state_dict(destination, prefix, keep_vars)
+        if self.step_rule is not None:
+            destination[prefix + STEP_STATE] = th.tensor([self.sub_steps, self.updates])
+            destination[prefix + STEP_DIRECTION] = self.lipschitz.direction.clone()
+
+    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+        """Take over weights and K.
+
+        The index tables of the cell are part of the state, so weights of another wiring are recognised and refused:
+        they would act through its synapses while ``net.wiring`` still described the present ones.
+        """
+        for name, own in self.cell.named_buffers(prefix="cell"):
+            given = state_dict.get(prefix + name)
+            if given is not None and not (given.shape == own.shape and bool((given.to(own) == own).all())):
+                raise RuntimeError(
+                    f"{prefix}{name} is that of another wiring; build the network with the wiring that the weights "
+                    "belong to (the same sizes, fans, seed, sensory_to and synapses)"
+                )
+        chosen, direction = (state_dict.pop(prefix + name, None) for name in (STEP_STATE, STEP_DIRECTION))
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self._restore_step = None if chosen is None else (chosen.tolist(), direction)
+
+    def draw(self, ax: Any = None, input_names: Sequence[str] | None = None) -> Any:
+        """Draw neurons and synapses with their present polarities, which training may turn where they are lean.
+
+        :param ax: matplotlib axes to draw into; new ones by default
+        :param input_names: a name per sensory neuron
+        :return: the axes
+        """
+        return self.signed_wiring().draw(ax, input_names)
+
+    def signed_wiring(self) -> NDBCWiring:
+        """The wiring with the polarities as they are now."""
+        cell = self.cell
+        return self.wiring.with_signs(*cell.signs(self.wiring)) if isinstance(cell, LeanCell) else self.wiring
 
     def refresh_step(self) -> int:
         """Choose K by the step-size rule from the present weights; without a rule K stays as it is."""
@@ -230,7 +298,7 @@ class NDBCNet(nn.Module):
         if isinstance(cell, DissipativeCell):
             return (1.0 / cell.arrays().damping).expand(len(state), -1)
         arrays = cell.arrays()
-        conductance = cell.drive(inputs * self.input_gain, arrays, th.zeros_like(arrays.capacitance))
+        conductance = cell.input_terms(inputs * self.input_gain, arrays, th.zeros_like(arrays.capacitance))
         released = th.sigmoid(state[:, : cell.n_presynaptic] * arrays.gain - cell.threshold)
         return arrays.capacitance / (conductance + released @ arrays.recurrent)[:, self.state_dim :]
 
@@ -244,22 +312,42 @@ class NDBCNet(nn.Module):
         return self.cell.certificate(1.0 / self.sub_steps)
 
 
-def _check_options(
-    n_inputs: int,
-    n_outputs: int,
-    wiring: NDBCWiring,
-    sub_steps: int,
-    dynamics: str,
-    readout: str,
-    max_rho: float | None,
-) -> None:
+def _after_loading(net: NDBCNet, _: Any) -> None:
+    """Once all weights are there: K and its companions as they were saved."""
+    if net.step_rule is None:
+        return
+    if net._restore_step is None:  # saved by a version that did not keep K
+        net.refresh_step()
+        return
+    (net.sub_steps, net.updates), direction = net._restore_step
+    net.lipschitz.direction.copy_(direction)
+
+
+def _check_sizes(n_inputs: int, n_outputs: int, wiring: NDBCWiring, sub_steps: int) -> None:
     if n_inputs != wiring.n_inputs:
         raise ValueError(f"n_inputs={n_inputs}, but the wiring has {wiring.n_inputs} sensory neurons")
-    if n_outputs < 1 or sub_steps < 1:
-        raise ValueError(f"n_outputs and sub_steps must be at least 1, got {n_outputs} and {sub_steps}")
-    if dynamics not in DYNAMICS:
-        raise ValueError(f"dynamics must be one of {DYNAMICS}, got {dynamics!r}")
-    if readout not in ("all", "motor"):
-        raise ValueError(f"readout must be 'all' or 'motor', got {readout!r}")
+    for name, value in (("n_outputs", n_outputs), ("sub_steps", sub_steps)):
+        if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+            raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+
+
+def _check_options(dynamics: str, readout: str, max_rho: float | None, synapses: str) -> None:
+    for name, value, allowed in (
+        ("dynamics", dynamics, DYNAMICS),
+        ("readout", readout, ("all", "motor")),
+        ("synapses", synapses, SYNAPSES),
+    ):
+        if value not in allowed:
+            raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
     if max_rho is not None and dynamics != "dissipative":
         raise ValueError("max_rho belongs to dynamics='dissipative'; conductance dynamics are bounded as they are")
+    if synapses != "paper" and dynamics != "conductance":
+        raise ValueError(f"synapses={synapses!r} belongs to dynamics='conductance', got dynamics={dynamics!r}")
+
+
+def _check_intervals(interval: th.Tensor) -> None:
+    """Refuse lengths that are negative or NaN; a graph under construction cannot look at values and takes them."""
+    if th.compiler.is_compiling():
+        return
+    if not bool((interval >= 0).all()):
+        raise ValueError(f"interval must not be negative or NaN, smallest is {float(interval.min())}: it is a length")

@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 from torch import nn
 
-from sb3_tbc.ndbc.cell import ConductanceArrays
+from sb3_tbc.ndbc.cell import Cell, ConductanceArrays
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class LipschitzProxy(nn.Module):
         self.register_buffer("direction", th.full((n_neurons,), n_neurons**-0.5), persistent=False)
 
     @th.no_grad()
-    def evaluate(self, cell: Any, iterations: int) -> float:
+    def evaluate(self, cell: Cell, iterations: int) -> float:
         """Estimate of the norm after some more iterations; from below, and better with every call."""
         block = recurrent_block(cell.arrays())
         for _ in range(iterations):
@@ -101,7 +101,7 @@ def recurrent_block(arrays: Any) -> th.Tensor:
 
 
 def advance_checked(
-    cell: Any, inputs: th.Tensor, state: th.Tensor, interval: th.Tensor, sub_steps: int, rule: StepRule
+    cell: Cell, inputs: th.Tensor, state: th.Tensor, interval: th.Tensor, sub_steps: int, rule: StepRule
 ) -> th.Tensor:
     """One control step with the half-step check: samples that move too far in a sub-step run again with twice as many.
 
@@ -114,11 +114,11 @@ def advance_checked(
     :return: the state one control step later
     """
     arrays = cell.arrays()
-    pace = cell.pace(arrays, interval / sub_steps)
-    drive = cell.drive(inputs, arrays, pace)
+    step_terms = cell.step_terms(arrays, interval / sub_steps)
+    input_terms = cell.input_terms(inputs, arrays, step_terms)
     current, too_far = state, th.zeros(len(state), dtype=th.bool, device=state.device)
     for _ in range(sub_steps):
-        following = cell.step(current, drive, arrays, pace)
+        following = cell.step(current, input_terms, arrays, step_terms)
         allowed = rule.relative_tolerance * current.norm(dim=-1) + rule.absolute_tolerance
         too_far |= (following - current).norm(dim=-1) > allowed
         current = following

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,13 @@ class NDBCWiring:
     :param recurrent_command_synapses: synapses among the command neurons, in all (no autapses)
     :param motor_fanin: command neurons each motor neuron listens to
     :param seed: seed of the draw, of targets as well as of polarities
-    :raises ValueError: if a size is not a positive integer or a fan is negative
+    :param sensory_to: layers that sensory neurons project to, each with ``sensory_fanout``: the paper's ``("inter",)``,
+        or with reflexes that bypass inter neurons, ``("inter", "command")`` or ``("inter", "command", "motor")``
+    :raises ValueError: if a size is not a positive integer, a fan is negative or ``sensory_to`` is something else
     """
+
+    drawer: ClassVar[Callable[..., Any] | None] = None
+    """What :meth:`draw` calls; set where the package is put together, since drawing builds upon wirings."""
 
     def __init__(
         self,
@@ -47,8 +52,9 @@ class NDBCWiring:
         recurrent_command_synapses: int,
         motor_fanin: int,
         seed: int = 0,
+        sensory_to: Sequence[str] = ("inter",),
     ) -> None:
-        self._set_sizes(n_inputs, inter, command, motor)
+        self._set_sizes(n_inputs, inter, command, motor, sensory_to=sensory_to)
         self.seed = seed
         self.notes: tuple[str, ...] = ()
         rng = np.random.default_rng(seed)
@@ -69,12 +75,23 @@ class NDBCWiring:
             among[pairs[k]] = True
         self.recurrent[command_at, command_at] = _signed(rng, among)
         self.recurrent[command_at, motor_at] = _signed(rng, _fan_out(rng, motor, command, motor_fanin, rescue=False).T)
+        for name in self.sensory_to[1:]:  # last, so that all other draws are those of the wiring without reflexes
+            size = getattr(self, name)
+            fan = min(sensory_fanout, size)
+            self.sensory[:, self.layer(name)] = _signed(rng, _fan_out(rng, n_inputs, size, fan))
 
-    def _set_sizes(self, n_inputs: int, inter: int, command: int, motor: int) -> None:
+    def _set_sizes(
+        self, n_inputs: int, inter: int, command: int, motor: int, *, sensory_to: Sequence[str] = ("inter",)
+    ) -> None:
         for name, size in {"n_inputs": n_inputs, "inter": inter, "command": command, "motor": motor}.items():
             if not isinstance(size, int | np.integer) or size < 1:
                 raise ValueError(f"{name} must be a positive whole number, got {size!r}")
         self.n_inputs, self.inter, self.command, self.motor = int(n_inputs), int(inter), int(command), int(motor)
+        self.sensory_to = (sensory_to,) if isinstance(sensory_to, str) else tuple(sensory_to)
+        allowed = [LAYERS[: i + 1] for i in range(len(LAYERS))]
+        if self.sensory_to not in allowed:
+            listed = ", ".join(str(list(layers)) for layers in allowed)
+            raise ValueError(f"sensory_to must be one of {listed}, got {sensory_to!r}")
 
     def _clip(self, name: str, fan: int, limit: int, of_what: str, least: int = 1) -> int:
         if not isinstance(fan, int | np.integer) or fan < least:
@@ -89,6 +106,11 @@ class NDBCWiring:
     def n_neurons(self) -> int:
         """Neurons with a membrane potential: inter + command + motor."""
         return self.inter + self.command + self.motor
+
+    @property
+    def n_driven(self) -> int:
+        """Neurons that inputs act on directly: the first ones of the state vector, as many as ``sensory_to`` holds."""
+        return int(self.layer(self.sensory_to[-1]).stop)
 
     @property
     def n_synapses(self) -> int:
@@ -118,8 +140,13 @@ class NDBCWiring:
     def relaxation_order(self) -> tuple[tuple[int, ...], ...]:
         """Groups of neurons, each of which hears only neurons of earlier groups, as far as there is no loop.
 
-        A loop is opened at the one of its neurons that hears the fewest of those still to come.
+        The closed form (paper, section 4.3) takes the neurons in this order, so that a signal passes from sensory to
+        motor neurons within one control step. A loop is opened at the one of its neurons that hears the fewest of those
+        still to come.
         """
+        # Transitive closure (Warshall): two neurons that reach each other are in one loop. In every round those go
+        # that hear nobody who still waits upstream of their loop; within a loop, where everybody hears somebody
+        # waiting, the one with the fewest such voices goes first and hears them as they were.
         heard = self.recurrent != 0
         np.fill_diagonal(heard, False)
         before = heard.copy()  # whether a path leads from one neuron to the other
@@ -141,6 +168,7 @@ class NDBCWiring:
         return {
             **{name: getattr(self, name) for name in ("n_inputs", *LAYERS)},
             "seed": self.seed,
+            "sensory_to": list(self.sensory_to),
             "notes": list(self.notes),
             "sensory_synapses": _to_list(self.sensory),
             "synapses": _to_list(self.recurrent),
@@ -155,12 +183,24 @@ class NDBCWiring:
         if "synapses" not in data:
             return cls(**data)
         wiring = cls.__new__(cls)
-        wiring._set_sizes(*(data[name] for name in ("n_inputs", *LAYERS)))
+        sizes = (data[name] for name in ("n_inputs", *LAYERS))
+        wiring._set_sizes(*sizes, sensory_to=data.get("sensory_to", ("inter",)))
         wiring.seed = int(data.get("seed", 0))
         wiring.notes = tuple(data.get("notes", ()))
         wiring.sensory = _from_list(data["sensory_synapses"], (wiring.n_inputs, wiring.n_neurons))
         wiring.recurrent = _from_list(data["synapses"], (wiring.n_neurons, wiring.n_neurons))
+        if wiring.sensory[:, wiring.n_driven :].any():
+            raise ValueError(f"a sensory synapse ends outside of sensory_to={list(wiring.sensory_to)}; name its layer")
         return wiring
+
+    def with_signs(self, sensory: SignMatrix, recurrent: SignMatrix) -> NDBCWiring:
+        """The same synapses with other polarities.
+
+        :param sensory: ``(n_inputs, n_neurons)``
+        :param recurrent: ``(n_neurons, n_neurons)``
+        """
+        lists = {"sensory_synapses": _to_list(sensory), "synapses": _to_list(recurrent)}
+        return NDBCWiring.from_dict({**self.to_dict(), **lists})
 
     @classmethod
     def from_ncps(cls, wiring: Any) -> NDBCWiring:
@@ -187,10 +227,15 @@ class NDBCWiring:
         return drawn
 
     def draw(self, ax: Any = None, input_names: Sequence[str] | None = None) -> Any:
-        """Draw neurons and synapses with matplotlib; see :func:`sb3_tbc.ndbc.drawing.draw_wiring`."""
-        from sb3_tbc.ndbc.drawing import draw_wiring
+        """Draw neurons and synapses with matplotlib; see :func:`sb3_tbc.ndbc.drawing.draw_wiring`.
 
-        return draw_wiring(self, ax, input_names)
+        :param ax: matplotlib axes to draw into; new ones by default
+        :param input_names: a name per sensory neuron
+        :return: the axes
+        """
+        if self.drawer is None:
+            raise RuntimeError("nothing draws wirings yet: import sb3_tbc.ndbc")
+        return self.drawer(self, ax, input_names)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, NDBCWiring) and self.to_dict() == other.to_dict()
@@ -199,7 +244,8 @@ class NDBCWiring:
 
     def __repr__(self) -> str:
         sizes = f"{self.n_inputs} sensory, {self.inter} inter, {self.command} command, {self.motor} motor"
-        return f"NDBCWiring({sizes} neurons, {self.n_synapses} synapses, seed={self.seed})"
+        reflexes = f", sensory_to={list(self.sensory_to)}" if len(self.sensory_to) > 1 else ""
+        return f"NDBCWiring({sizes} neurons, {self.n_synapses} synapses, seed={self.seed}{reflexes})"
 
 
 def _fan_out(rng: np.random.Generator, sources: int, targets: int, fan: int, rescue: bool = True) -> NDArray[np.bool_]:

@@ -36,6 +36,8 @@ NDBC: Schema = {
     **dict.fromkeys(("inter", "command", "motor", "sensory_fanout", "inter_fanout"), int),
     **dict.fromkeys(("recurrent_command_synapses", "motor_fanin", "seed", "sub_steps"), int),
     "dynamics": str,
+    "synapses": str,
+    "sensory_to": list,
     "input_scale": list,
 }
 POLICY: Schema = {

@@ -39,6 +39,8 @@ ANT = {"inter": 12, "command": 10, "motor": 8, "sensory_fanout": 5, "inter_fanou
 PENDULUM = {"inter": 6, "command": 6, "motor": 1, "sensory_fanout": 3, "inter_fanout": 4,
             "recurrent_command_synapses": 1, "motor_fanin": 4}  # fmt: skip
 DISSIPATIVE = {**PENDULUM, "dynamics": "dissipative", "max_rho": 0.97}
+LEAN = {**PENDULUM, "synapses": "lean"}
+REFLEX = {**PENDULUM, "sensory_to": ["inter", "command", "motor"]}
 CASES = {
     "reached": ("Pendulum", {"window_end": "reached", "memory": "window"}),
     "relative": ("UR5Reacher", {"window_end": "reached", "relative_subgoals": True, "memory": "episode", "dt_min": 3}),
@@ -46,6 +48,9 @@ CASES = {
     "memoryless": ("Pendulum", {"memory": "none"}),
     "hac": ("Pendulum", {}),
     "dissipative": ("Pendulum", {"memory": "window", "low": {"policy_kwargs": {"ndbc": DISSIPATIVE}}}),
+    "lean": ("Pendulum", {"window_end": "reached", "memory": "window", "low": {"policy_kwargs": {"ndbc": LEAN}}}),
+    "reflex": ("Pendulum", {"memory": "window", "low": {"policy_kwargs": {"ndbc": REFLEX}}}),
+    "lean reflex": ("Pendulum", {"memory": "episode", "low": {"policy_kwargs": {"ndbc": {**REFLEX, **LEAN}}}}),
     "event": ("Bell", {"dt_max": 12.0, "memory": "window"}),
 }
 
@@ -95,7 +100,7 @@ def trained_look(model: TBCHRL, seed: int = 0) -> TBCHRL:
 
 
 @pytest.mark.parametrize("kind", ["numpy", "onnx", pytest.param("c", marks=needs_cc)])
-@pytest.mark.parametrize("case", ["reached", "relative", "mlp", "memoryless", "dissipative"])
+@pytest.mark.parametrize("case", ["reached", "relative", "mlp", "memoryless", "dissipative", "lean", "lean reflex"])
 def test_large_weights_do_not_part_them(case: str, kind: str, tmp_path: Path) -> None:
     if kind == "onnx":
         pytest.importorskip("onnxruntime")
@@ -139,11 +144,12 @@ def assert_every_format_agrees(model: TBCHRL, env: gym.Env, folder: Path) -> Non
                 in_numpy.reset()
 
 
-@pytest.mark.parametrize("case", ["reached", "memoryless"])
+@pytest.mark.parametrize("case", ["reached", "memoryless", "lean reflex"])
 def test_a_trained_agent_is_exported_as_it_acts(case: str, tmp_path: Path) -> None:
     fast = {"learning_rate": 1e-2, "batch_size": 32, "policy_kwargs": {"net_arch": [12, 8]}}
     env = gym.make("sb3_tbc/Pendulum-v0")
-    low = {**fast, "policy_kwargs": {**fast["policy_kwargs"], "ndbc": PENDULUM}}
+    ndbc = CASES[case][1].get("low", {"policy_kwargs": {"ndbc": PENDULUM}})["policy_kwargs"]["ndbc"]
+    low = {**fast, "policy_kwargs": {**fast["policy_kwargs"], "ndbc": ndbc}}
     model = TBCHRL("MultiInputPolicy", env, seed=1, compile=False, **{**CASES[case][1], "high": fast, "low": low})
     before = model.low.policy.average_actor.net.readout_weight.detach().clone()
     model.learn(500)
@@ -175,8 +181,10 @@ def test_an_onnx_graph_takes_a_batch(pendulum: tuple[TBCHRL, ExportedPolicy], tm
 
 
 @needs_cc
-def test_the_c_closed_form_is_the_closed_form(pendulum: tuple[TBCHRL, ExportedPolicy], tmp_path: Path) -> None:
-    model, policy = pendulum
+@pytest.mark.parametrize("case", ["reached", "reflex", "lean", "lean reflex"])
+def test_the_c_closed_form_is_the_closed_form(case: str, tmp_path: Path) -> None:
+    model, _ = make(case)
+    policy = extract(trained_look(model) if case != "reached" else model, case)
     (tmp_path / "policy.c").write_text(to_c(policy))
     player = CPlayer(tmp_path / "policy.c", policy)
     reference = ClosedFormNDBC(model.low.policy.average_actor.net)
@@ -218,7 +226,9 @@ int main(void)
 
 
 @needs_cc
-@pytest.mark.parametrize("case", ["reached", "relative", "mlp", "dissipative", "event"])
+@pytest.mark.parametrize(
+    "case", ["reached", "relative", "mlp", "dissipative", "event", "lean", "reflex", "lean reflex"]
+)
 def test_the_c_file_is_clean_under_sanitizers(case: str, tmp_path: Path) -> None:
     (tmp_path / "policy.c").write_text(to_c(extract(make(case)[0], case)))
     (tmp_path / "main.c").write_text(MAIN)

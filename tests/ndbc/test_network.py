@@ -142,7 +142,9 @@ def test_outputs_start_near_zero_mean() -> None:
 
 @pytest.mark.parametrize(
     ("kwargs", "named"),
-    [({"sub_steps": 0}, "sub_steps"), ({"dynamics": "chaotic"}, "chaotic"), ({"readout": "none"}, "readout"),
+    [({"sub_steps": 0}, "sub_steps"), ({"sub_steps": 2.7}, "sub_steps"), ({"sub_steps": True}, "sub_steps"),
+     ({"synapses": "fat"}, "fat"), ({"synapses": "lean", "dynamics": "dissipative"}, "lean"),
+     ({"dynamics": "chaotic"}, "chaotic"), ({"readout": "none"}, "readout"),
      ({"input_scale": [1.0]}, "input_scale"), ({"max_rho": 0.9}, "max_rho"), ({"n_outputs": 0}, "n_outputs")],
 )  # fmt: skip
 def test_a_wrong_option_is_named(kwargs: dict[str, object], named: str) -> None:
@@ -156,3 +158,38 @@ def test_a_wrong_shape_is_named() -> None:
         net(th.zeros(2, 5))
     with pytest.raises(ValueError, match="one entry per step"):
         net(th.zeros(2, 3, 6), mask=th.ones(2))
+
+
+def test_a_lean_network_draws_the_polarities_it_has_come_to() -> None:
+    pytest.importorskip("matplotlib").use("Agg")
+    net = small_net(synapses="lean")
+    with th.no_grad():
+        net.cell.synapse[:] = -net.cell.synapse.abs()
+        net.cell.current_weight[:] = net.cell.current_weight.abs()
+    ax = net.draw()
+    arrows = [text.arrow_patch for text in ax.texts if getattr(text, "arrow_patch", None) is not None]
+    assert len(arrows) == net.wiring.n_synapses
+    colours = {arrow.get_edgecolor()[:3] for arrow in arrows}
+    assert len(colours) == 2
+    inhibitory = sum(arrow.get_edgecolor()[2] > arrow.get_edgecolor()[0] for arrow in arrows)
+    assert inhibitory == np.count_nonzero(net.wiring.recurrent)
+    assert small_net().draw() is not None
+
+
+@pytest.mark.parametrize("synapses", ["paper", "lean"])
+def test_a_cut_synapse_carries_nothing(synapses: str) -> None:
+    net = small_net(synapses=synapses)
+    pairs = [*np.argwhere(net.wiring.sensory).tolist(), *np.argwhere(net.wiring.recurrent).tolist()]
+    n_sensory = np.count_nonzero(net.wiring.sensory)
+    for index, (pre, post) in enumerate(pairs):
+        cut = small_net(synapses=synapses)
+        cut.cell.cut(index)
+        before, after = net.cell.arrays(), cut.cell.arrays()
+        changed = {
+            (i, int(j) % net.state_dim, name)
+            for name in ("current_weight", "from_inputs", "recurrent")
+            for i, j in np.argwhere((getattr(before, name) != getattr(after, name)).numpy()).tolist()
+        }
+        names = {"recurrent"} if index >= n_sensory else {"current_weight"}
+        names |= {"from_inputs"} if index < n_sensory and synapses == "paper" else set()
+        assert changed == {(pre, post, name) for name in names}

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -15,17 +17,24 @@ from scipy.integrate import solve_ivp
 from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.ndbc.closed_form import ClosedFormNDBC
 from sb3_tbc.ndbc.diagnostics import check_finite
-from sb3_tbc.ndbc.network import DYNAMICS, NDBCNet
+from sb3_tbc.ndbc.frozen import FrozenNDBC
+from sb3_tbc.ndbc.network import DYNAMICS, SYNAPSES, NDBCNet
 from sb3_tbc.ndbc.stepping import StepRule, recurrent_block
 from sb3_tbc.ndbc.wiring import NDBCWiring
 
 SEEDS = st.integers(0, 10_000)
+FORMS = [
+    {"synapses": synapses, "sensory_to": layers}
+    for synapses in SYNAPSES
+    for layers in (("inter",), ("inter", "command"), ("inter", "command", "motor"))
+]
+FORM = st.sampled_from(FORMS)
 
 
-def random_net(seed: int, spread: float = 1.0, **kwargs: object) -> NDBCNet:
+def random_net(seed: int, spread: float = 1.0, sensory_to: Sequence[str] = ("inter",), **kwargs: object) -> NDBCNet:
     """A small network whose free parameters were all pushed around by ``spread`` standard deviations."""
     wiring = NDBCWiring(3, inter=4, command=4, motor=2, sensory_fanout=2, inter_fanout=3,
-                        recurrent_command_synapses=3, motor_fanin=3, seed=seed)  # fmt: skip
+                        recurrent_command_synapses=3, motor_fanin=3, seed=seed, sensory_to=sensory_to)  # fmt: skip
     net = NDBCNet(3, 2, wiring, seed=seed, **kwargs)  # type: ignore[arg-type]
     generator = th.Generator().manual_seed(seed + 1)
     with th.no_grad():
@@ -40,19 +49,24 @@ def derivative(net: NDBCNet, inputs: NDArray[np.float64]) -> object:
     value = {name: v.detach().numpy() for name, v in cell.values()._asdict().items()}
     fixed = {name: p.detach().numpy() for name, p in cell.named_parameters()}
     u = inputs * net.input_gain.numpy()
-    sensed = 1 / (1 + np.exp(fixed["sensory_threshold"] - value["sensory_gain"] * u))
+    lean = net.synapses == "lean"
     current = fixed["current_bias"].copy()
-    synapses = [(True, i, j) for i, j in np.argwhere(wiring.sensory)]
-    synapses += [(False, i, j) for i, j in np.argwhere(wiring.recurrent)]
-    for k, (_, i, j) in enumerate(s for s in synapses if s[0]):
+    wired = [(True, i, j, wiring.sensory[i, j]) for i, j in np.argwhere(wiring.sensory)]
+    for k, (_, i, j, _) in enumerate(wired):
         current[j] += fixed["current_weight"][k] * u[i]
+    synapses = [] if lean else wired
+    synapses += [(False, i, j, wiring.recurrent[i, j]) for i, j in np.argwhere(wiring.recurrent)]
+    if lean:
+        value["conductance"], value["reversal"] = np.abs(fixed["synapse"]), np.ones(len(synapses))
+        synapses = [(*s[:3], np.sign(x)) for s, x in zip(synapses, fixed["synapse"], strict=True)]
+    else:
+        sensed = 1 / (1 + np.exp(fixed["sensory_threshold"] - value["sensory_gain"] * u))
 
     def rate(_: float, potentials: NDArray[np.float64]) -> NDArray[np.float64]:
         flow = value["leak"] * (fixed["leak_potential"] - potentials)
         m = len(current)
         flow[:m] += value["input_conductance"] * (np.tanh(current) - potentials[:m])
-        for k, (sensory, i, j) in enumerate(synapses):
-            sign = (wiring.sensory if sensory else wiring.recurrent)[i, j]
+        for k, (sensory, i, j, sign) in enumerate(synapses):
             release = (
                 sensed[i] if sensory else 1 / (1 + np.exp(fixed["threshold"][i] - value["gain"][i] * potentials[i]))
             )
@@ -68,10 +82,12 @@ def exact(
     return solve_ivp(derivative(net, inputs), (0.0, duration), state, rtol=1e-10, atol=1e-12, method="LSODA").y[:, -1]
 
 
-@given(SEEDS, st.integers(1, 6), st.floats(0.01, 100.0), st.floats(0.1, 10.0))
-@settings(max_examples=60, deadline=None)
-def test_potentials_stay_in_their_bound(seed: int, sub_steps: int, interval: float, size: float) -> None:
-    net = random_net(seed, spread=2.0, sub_steps=sub_steps)
+@given(SEEDS, FORM, st.integers(1, 6), st.floats(0.01, 100.0), st.floats(0.1, 10.0))
+@settings(max_examples=100, deadline=None)
+def test_potentials_stay_in_their_bound(
+    seed: int, form: dict[str, object], sub_steps: int, interval: float, size: float
+) -> None:
+    net = random_net(seed, spread=2.0, sub_steps=sub_steps, **form)
     generator = th.Generator().manual_seed(seed)
     state = size * th.randn(8, net.state_dim, generator=generator)
     inputs = 10 * size * th.randn(8, 5, 3, generator=generator)
@@ -83,10 +99,23 @@ def test_potentials_stay_in_their_bound(seed: int, sub_steps: int, interval: flo
     assert (trace <= high + slack).all()
 
 
-@given(SEEDS)
-@settings(max_examples=10, deadline=None)
-def test_halving_the_step_converges_at_first_order(seed: int) -> None:
-    net = random_net(seed, spread=0.5).double()
+@pytest.mark.parametrize("form", FORMS)
+def test_the_bound_is_reached_by_what_pulls_there(form: dict[str, object]) -> None:
+    net = random_net(0, spread=0.0, **form)
+    low, high = net.cell.bounds()
+    with th.no_grad():
+        net.cell.current_bias[:] = 40.0
+        net.cell.raw_input_conductance[:] = 1e4
+        pulled = net(th.zeros(1, 3))[1][0, : net.cell.n_driven]
+    assert (low <= -1.0)[: net.cell.n_driven].all()
+    assert (high >= 1.0)[: net.cell.n_driven].all()
+    assert (pulled > 0.99).all(), "the input current reaches every layer of sensory_to"
+
+
+@given(SEEDS, FORM)
+@settings(max_examples=12, deadline=None)
+def test_halving_the_step_converges_at_first_order(seed: int, form: dict[str, object]) -> None:
+    net = random_net(seed, spread=0.5, **form).double()
     rng = np.random.default_rng(seed)
     inputs, state = rng.normal(size=3), 0.5 * rng.normal(size=net.state_dim)
     reference = exact(net, inputs, state)
@@ -100,10 +129,12 @@ def test_halving_the_step_converges_at_first_order(seed: int) -> None:
     np.testing.assert_allclose(orders, 1.0, atol=0.15)
 
 
-@given(SEEDS, st.floats(0.2, 3.0), st.floats(0.0, 2.0), st.floats(0.1, 3.0))
-@settings(max_examples=40, deadline=None)
-def test_closed_form_error_bound_holds(seed: int, size: float, spread: float, duration: float) -> None:
-    net = random_net(seed, spread=spread).double()
+@given(SEEDS, FORM, st.floats(0.2, 3.0), st.floats(0.0, 2.0), st.floats(0.1, 3.0))
+@settings(max_examples=60, deadline=None)
+def test_closed_form_error_bound_holds(
+    seed: int, form: dict[str, object], size: float, spread: float, duration: float
+) -> None:
+    net = random_net(seed, spread=spread, **form).double()
     closed = ClosedFormNDBC(net, dtype=np.float64)
     rng = np.random.default_rng(seed)
     inputs, state = size * rng.normal(size=(1, 3)), size * rng.normal(size=(1, net.state_dim))
@@ -207,6 +238,173 @@ def test_masked_synapses_stay_exactly_zero_and_polarity_is_kept(seed: int, updat
     assert trained < dense, "what the wiring leaves out has no parameter that could get a gradient"
 
 
+@given(SEEDS, st.integers(0, 40), st.floats(1e-3, 0.1), st.booleans())
+@settings(max_examples=15, deadline=None)
+def test_a_lean_synapse_is_one_number_and_missing_ones_stay_zero(
+    seed: int, updates: int, rate: float, reflexes: bool
+) -> None:
+    layers = ("inter", "command", "motor") if reflexes else ("inter",)
+    net = random_net(seed, synapses="lean", sensory_to=layers)
+    optimizer = th.optim.AdamW(net.parameters(), lr=rate, weight_decay=0.1)
+    for _ in range(updates):
+        loss = (net(th.randn(32, 3))[0] - 1.0).square().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    arrays, n, wiring = net.cell.arrays(), net.state_dim, net.wiring
+    pulled, conductance = arrays.recurrent.detach().split(n, dim=1)
+    assert th.equal(pulled.abs(), conductance), "a reversal potential of +1 or -1"
+    np.testing.assert_array_equal(conductance.numpy() != 0, wiring.recurrent[: len(conductance)] != 0)
+    np.testing.assert_array_equal(
+        arrays.current_weight.detach().numpy() != 0, wiring.sensory[:, : wiring.n_driven] != 0
+    )
+    per_pair = {"synapse": np.count_nonzero(wiring.recurrent), "current_weight": np.count_nonzero(wiring.sensory)}
+    assert {name: net.cell.get_parameter(name).numel() for name in per_pair} == per_pair
+    rest = {name for name, p in net.cell.named_parameters() if p.numel() > n}
+    assert rest <= set(per_pair), "everything else belongs to a neuron"
+    sensory, recurrent = net.cell.signs(wiring)
+    np.testing.assert_array_equal(np.sign(pulled.numpy()), recurrent[: len(pulled)])
+    np.testing.assert_array_equal(np.sign(arrays.current_weight.detach().numpy()), sensory[:, : wiring.n_driven])
+
+
+@given(SEEDS, FORM, st.integers(1, 6))
+@settings(max_examples=40, deadline=None)
+def test_all_forms_of_a_network_compute_the_same(seed: int, form: dict[str, object], sub_steps: int) -> None:
+    net = random_net(seed, spread=0.5, sub_steps=sub_steps, **form)
+    frozen, generator = FrozenNDBC(net), th.Generator().manual_seed(seed)
+    inputs, state = th.randn(4, 5, 3, generator=generator), th.randn(4, net.state_dim, generator=generator)
+    outputs, last = net(inputs, state)
+    outputs.sum().backward()
+    gradients = [p.grad.clone() for p in net.parameters()]
+    net.zero_grad()
+    stepped, potentials, numpy_state = 0.0, state, state.numpy()
+    for t in range(5):
+        output, potentials = net(inputs[:, t], potentials)
+        numpy_output, numpy_state = frozen(inputs[:, t].numpy(), numpy_state)
+        th.testing.assert_close(output, outputs[:, t], atol=1e-4, rtol=1e-4)
+        np.testing.assert_allclose(numpy_output, output.detach().numpy(), atol=1e-4)
+        stepped = stepped + output.sum()
+    th.testing.assert_close(potentials, last, atol=1e-4, rtol=1e-4)
+    stepped.backward()
+    for name, gradient in zip(dict(net.named_parameters()), gradients, strict=True):
+        th.testing.assert_close(gradient, net.get_parameter(name).grad, atol=2e-3, rtol=2e-3)
+
+
+KINDS = [{"dynamics": "dissipative"}, *FORMS]
+
+
+@given(SEEDS, st.sampled_from(KINDS), st.integers(0, 4))
+@settings(max_examples=30, deadline=None)
+def test_a_reset_heals_a_state_that_is_not_a_number(seed: int, kind: dict[str, object], broken: int) -> None:
+    net = random_net(seed, **kind)
+    generator = th.Generator().manual_seed(seed)
+    inputs, mask = th.randn(3, 5, 3, generator=generator), th.ones(3, 5)
+    state = th.randn(3, net.state_dim, generator=generator)
+    state[1], mask[1, 0] = float("nan"), 0.0
+    outputs, last = net(inputs, state, mask)
+    outputs.sum().backward()
+    assert th.isfinite(outputs).all()
+    assert th.isfinite(last).all()
+    assert all(th.isfinite(p.grad).all() for p in net.parameters())
+    th.testing.assert_close(net(inputs[:, 0], state, mask[:, 0])[0], outputs[:, 0])
+    inputs[2, broken], mask[2, min(broken + 1, 4)] = float("inf") * 0.0, 0.0
+    healed = net.unroll(inputs, state, mask)[2, broken + 1 :]
+    assert th.isfinite(healed).all()
+
+
+@given(SEEDS, st.sampled_from(KINDS), st.integers(1, 6))
+@settings(max_examples=30, deadline=None)
+def test_intervals_of_zero_leave_the_state_and_negative_ones_are_refused(
+    seed: int, kind: dict[str, object], sub_steps: int
+) -> None:
+    net = random_net(seed, sub_steps=sub_steps, **kind)
+    inputs, state = th.randn(4, 3), th.randn(4, net.state_dim).requires_grad_()
+    interval = th.tensor([0.0, 1.0, 0.0, 0.5])
+    later = net(inputs, state, interval=interval)[1]
+    assert th.equal(later[[0, 2]], state[[0, 2]])
+    th.testing.assert_close(later[1], net(inputs, state)[1][1])
+    later.sum().backward()
+    assert th.isfinite(state.grad).all()
+    for wrong in (-1e-6, float("nan")):
+        with pytest.raises(ValueError, match="interval must not be negative"):
+            net(inputs, state, interval=th.tensor([1.0, wrong, 1.0, 1.0]))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_second_derivatives_are_right_for_steps_and_refused_for_sequences(kind: dict[str, object]) -> None:
+    net = random_net(0, spread=0.3, **kind).double()
+    x = th.randn(1, 1, 3, dtype=th.double, generator=th.Generator().manual_seed(0))
+    hessian = th.autograd.functional.hessian(lambda u: net(u[:, 0])[0].sum(), x).reshape(3, 3)
+    delta = 1e-5
+    for i in range(3):
+        step = th.zeros_like(x)
+        step[0, 0, i] = delta
+        ends = [th.autograd.functional.jacobian(lambda u: net(u[:, 0])[0].sum(), y) for y in (x + step, x - step)]
+        th.testing.assert_close(hessian[i], (ends[0] - ends[1]).flatten() / (2 * delta), atol=1e-6, rtol=1e-4)
+    if "dynamics" in kind:
+        whole = th.autograd.functional.hessian(lambda u: net(u)[0].sum(), x).reshape(3, 3)
+        th.testing.assert_close(whole, hessian)
+        return
+    for loss in (lambda u: net(u)[0].sum(), lambda u: net(u)[0].square().sum()):
+        with pytest.raises(RuntimeError, match="no second derivatives of sequences"):
+            th.autograd.functional.hessian(loss, x)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_function_transforms_work_on_steps(kind: dict[str, object]) -> None:
+    net = random_net(0, **kind)
+    x = th.randn(5, 3)
+    th.testing.assert_close(th.func.vmap(lambda u: net(u[None])[0][0])(x), net(x)[0], atol=1e-5, rtol=1e-5)
+    jacobian = th.func.vmap(th.func.jacrev(lambda u: net(u[None])[0][0]))(x)
+    assert jacobian.shape == (5, 2, 3)
+    if "dynamics" not in kind:
+        with pytest.raises(RuntimeError, match="functorch"):
+            th.func.jacrev(lambda u: net(u)[0])(x[:, None])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_batches_may_be_empty(kind: dict[str, object]) -> None:
+    net = random_net(0, **kind)
+    outputs, state = net(th.zeros(0, 3))
+    assert outputs.shape == (0, 2)
+    assert state.shape == (0, net.state_dim)
+    outputs, state = net(th.zeros(0, 4, 3), mask=th.ones(0, 4))
+    assert outputs.shape == (0, 4, 2)
+    outputs.sum().backward()
+    outputs, state = net(th.zeros(2, 0, 3), 0.3 * th.ones(2, net.state_dim))
+    assert outputs.shape == (2, 0, 2)
+    th.testing.assert_close(state, 0.3 * th.ones(2, net.state_dim))
+    frozen = FrozenNDBC(net)(np.zeros((0, 3), np.float32), np.zeros((0, net.state_dim), np.float32))
+    assert frozen[0].shape == (0, 2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_weights_of_another_wiring_are_refused(kind: dict[str, object]) -> None:
+    net, other = random_net(0, **kind), random_net(7, **kind)
+    before = copy.deepcopy(other.state_dict())
+    with pytest.raises(RuntimeError, match=r"another wiring|size mismatch"):
+        other.load_state_dict(net.state_dict())
+    assert all(th.equal(before[name], value) for name, value in other.state_dict().items()), "nothing was changed"
+    same = random_net(0, spread=0.1, **kind)
+    same.load_state_dict(net.state_dict())
+    th.testing.assert_close(same(th.ones(1, 3))[0], net(th.ones(1, 3))[0])
+
+
+def test_k_of_the_step_rule_travels_with_the_weights() -> None:
+    rule = {"eta": 3.0, "refresh_every": 10, "power_iterations": 1}
+    net, other = (random_net(seed, spread, adaptive_step=rule) for seed, spread in ((1, 0.5), (1, 0.0)))
+    net.after_update(7)
+    net.sub_steps = 5  # whatever the power iteration had come to when the weights were saved
+    other.load_state_dict(net.state_dict())
+    assert other.sub_steps == 5
+    assert [n.after_update(2) for n in (net, other)] == [False, False]
+    assert net.after_update(1) == other.after_update(1)
+    assert net.sub_steps == other.sub_steps
+    older = {name: value for name, value in net.state_dict().items() if not name.startswith("step_")}
+    other.load_state_dict(older)
+    assert 3 <= other.sub_steps <= 6
+
+
 @given(SEEDS, st.sampled_from(DYNAMICS), st.integers(1, 8), st.integers(1, 6))
 @settings(max_examples=30, deadline=None)
 def test_resets_per_sample_equal_one_at_a_time(seed: int, dynamics: str, steps: int, sub_steps: int) -> None:
@@ -287,10 +485,10 @@ def test_half_step_check_refines_exactly_the_samples_that_move_far(
 def moves_too_far(net: NDBCNet, rule: StepRule, inputs: th.Tensor, state: th.Tensor, sub_steps: int) -> bool:
     """Whether some sub-step moves by more than the tolerances allow."""
     arrays = net.cell.arrays()
-    pace = net.cell.pace(arrays, 1.0 / sub_steps)
-    drive, current = net.cell.drive(inputs[None] * net.input_gain, arrays, pace), state[None]
+    step_terms = net.cell.step_terms(arrays, 1.0 / sub_steps)
+    input_terms, current = net.cell.input_terms(inputs[None] * net.input_gain, arrays, step_terms), state[None]
     for _ in range(sub_steps):
-        following = net.cell.step(current, drive, arrays, pace)
+        following = net.cell.step(current, input_terms, arrays, step_terms)
         if (following - current).norm() > rule.relative_tolerance * current.norm() + rule.absolute_tolerance:
             return True
         current = following

@@ -104,6 +104,32 @@ def test_a_wrong_size_is_named(change: dict[str, float], named: str) -> None:
         NDBCWiring(6, **numbers)
 
 
+@pytest.mark.parametrize("layers", [("inter", "command"), ("inter", "command", "motor")])
+def test_reflexes_are_added_to_the_same_wiring(layers: tuple[str, ...]) -> None:
+    plain, reflex = (NDBCWiring(9, *TABLE_A1["AntFourRooms"], seed=2, sensory_to=to) for to in (("inter",), layers))
+    inter = plain.layer("inter")
+    np.testing.assert_array_equal(plain.recurrent, reflex.recurrent)
+    np.testing.assert_array_equal(plain.sensory[:, inter], reflex.sensory[:, inter])
+    for name in layers:
+        block = reflex.sensory[:, reflex.layer(name)]
+        assert (np.count_nonzero(block, axis=1) >= min(5, block.shape[1])).all()
+        assert block.any(axis=0).all(), "every neuron of the layer is reached"
+    assert reflex.n_driven == reflex.layer(layers[-1]).stop
+    assert not reflex.sensory[:, reflex.n_driven :].any()
+    assert NDBCWiring.from_dict(json.loads(json.dumps(reflex.to_dict()))) == reflex
+    assert "sensory_to" in repr(reflex)
+    data = reflex.to_dict()
+    del data["sensory_to"]
+    with pytest.raises(ValueError, match="sensory_to"):
+        NDBCWiring.from_dict(data)
+
+
+@pytest.mark.parametrize("layers", [("motor",), ("inter", "motor"), (), ("command", "inter"), ("inter", "sensory")])
+def test_other_targets_of_sensory_neurons_are_refused(layers: tuple[str, ...]) -> None:
+    with pytest.raises(ValueError, match=r"sensory_to must be one of \['inter'\]"):
+        NDBCWiring(9, *TABLE_A1["Pendulum"], sensory_to=layers)
+
+
 def test_a_synapse_to_nowhere_is_refused() -> None:
     data = NDBCWiring(6, *TABLE_A1["Pendulum"]).to_dict()
     data["synapses"].append([0, 13, 1])
@@ -134,7 +160,7 @@ def test_from_ncps_keeps_every_synapse() -> None:
 
 def test_it_draws_every_synapse() -> None:
     pytest.importorskip("matplotlib").use("Agg")
-    wiring = NDBCWiring(9, *TABLE_A1["UR5Reacher"])
+    wiring = NDBCWiring(9, *TABLE_A1["UR5Reacher"], sensory_to=("inter", "command", "motor"))
     ax = wiring.draw(input_names=[f"input {i}" for i in range(9)])
     arrows = [text for text in ax.texts if getattr(text, "arrow_patch", None) is not None]
     assert len(arrows) == wiring.n_synapses

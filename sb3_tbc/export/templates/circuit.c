@@ -7,6 +7,7 @@ static tbc_real logistic(tbc_real x)
 /* What the inputs contribute to numerator and denominator; constant over the sub-steps of one control step. */
 static void circuit_drive(const float *seen, tbc_real *weighted, tbc_real *total)
 {
+@PAPER@
     tbc_real released[TBC_SENSORY];
     int i, k;
     for (i = 0; i < TBC_SENSORY; ++i) {
@@ -21,6 +22,14 @@ static void circuit_drive(const float *seen, tbc_real *weighted, tbc_real *total
         weighted[i] = w;
         total[i] = g;
     }
+@END@
+@LEAN@
+    int i, k;
+    for (i = 0; i < TBC_STATE; ++i) {
+        weighted[i] = rest_weighted[i];
+        total[i] = rest_total[i];
+    }
+@END@
     for (i = 0; i < TBC_INTER; ++i) {
         tbc_real current = current_bias[i];
         for (k = current_begin[i]; k < current_begin[i + 1]; ++k) {
@@ -36,8 +45,15 @@ static inline void circuit_receive(int i, const tbc_real *released, tbc_real *we
     tbc_real w = *weighted, g = *total; /* in registers: through the pointers every sum would go to memory */
     int k;
     for (k = recurrent_begin[i]; k < recurrent_begin[i + 1]; ++k) {
+@PAPER@
         w += recurrent_weighted[k] * released[recurrent_pre[k]];
         g += recurrent_total[k] * released[recurrent_pre[k]];
+@END@
+@LEAN@
+        const tbc_real weight = recurrent_weighted[k] * released[recurrent_pre[k]];
+        w += weight;
+        g += weight < 0 ? -weight : weight; /* the conductance is the weight's size */
+@END@
     }
     *weighted = w;
     *total = g;
