@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import torch as th
@@ -33,6 +33,13 @@ class BurstBuffer(Protocol):
 
     def sample_burst(self, gradient_steps: int, batch_size: int) -> LevelBatch:
         """Sample tensors ``(gradient_steps, batch_size, ...)``."""
+
+
+class LabelledBuffer(BurstBuffer, Protocol):
+    """What a level with a ``label_coef`` asks of its replay buffer."""
+
+    def sample_labelled(self, gradient_steps: int, batch_size: int) -> tuple[LevelBatch, th.Tensor]:
+        """Sample tensors as :meth:`sample_burst`, and labels ``(gradient_steps, batch_size, 1)`` in [-1, 1]."""
 
 
 class SACLevel(SAC):
@@ -106,7 +113,11 @@ class SACLevel(SAC):
             self.ent_coef_optimizer.state[self.log_ent_coef] = {"step": th.tensor(0.0), **zeros}
         self.noise_rng = np.random.default_rng(self.seed)
         self._update = SACUpdate(
-            self.policy, self.ent_coef_optimizer, self.compile, self.label_coef, self.average_decay
+            self.policy,
+            ent_coef_optimizer=self.ent_coef_optimizer,
+            compile=self.compile,
+            label_coef=self.label_coef,
+            average_decay=self.average_decay,
         )
         self._frozen = {average: FrozenActor(self.policy, average) for average in (False, True)}
 
@@ -151,12 +162,11 @@ class SACLevel(SAC):
         self.logger.record(self.log_prefix + "n_updates", self._n_updates, exclude="tensorboard")
 
     def _run(self, gradient_steps: int, batch_size: int) -> dict[str, float]:
-        buffer: Any = self.replay_buffer
         labels: th.Tensor | None = None
         if self.label_coef:
-            batch, labels = buffer.sample_labelled(gradient_steps, batch_size)
+            batch, labels = cast(LabelledBuffer, self.replay_buffer).sample_labelled(gradient_steps, batch_size)
         else:
-            batch = buffer.sample_burst(gradient_steps, batch_size)
+            batch = cast(BurstBuffer, self.replay_buffer).sample_burst(gradient_steps, batch_size)
         shape = (gradient_steps, 2, batch.rewards.shape[1], self._update.action_dim)
         noise = th.from_numpy(self.noise_rng.standard_normal(shape, dtype=np.float32))
         return self._update.run(

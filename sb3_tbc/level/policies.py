@@ -1,7 +1,7 @@
 """Policies of one level: SB3's SAC policy with a circuit (NDBC) or MLP actor, bounded heads and an averaged actor.
 
-Every network names its parameters as :class:`Block` objects: which parameters lie side by side in the flat storage of
-:mod:`sb3_tbc.level.update`, and the shape under which one matrix product uses them all. Each network also has its
+Every network names its parameters as :class:`.Block` objects: which parameters lie side by side in the flat storage of
+:mod:`sb3_tbc.level.storage`, and the shape under which one matrix product uses them all. Each network also has its
 forward pass as a function of those blocks, which is what the update differentiates.
 """
 
@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
-from stable_baselines3.common.policies import BasePolicy, ContinuousCritic
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
@@ -22,23 +22,13 @@ from torch import nn
 from torch.nn import functional
 
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.level.critics import LevelCritic
+from sb3_tbc.level.storage import Block, linear_layers
 
 WIRING_KEYS = (
     "inter", "command", "motor", "sensory_fanout", "inter_fanout", "recurrent_command_synapses", "motor_fanin", "seed",
     "sensory_to",
 )  # fmt: skip
-
-
-class Block(NamedTuple):
-    """Parameters that lie one after the other in flat storage, and the shape in which they are used together."""
-
-    shape: tuple[int, ...]
-    parameters: tuple[nn.Parameter, ...]
-
-
-def linear_layers(module: nn.Module) -> list[nn.Linear]:
-    """The linear layers of an MLP, input side first."""
-    return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
 
 
 class GaussianHead:
@@ -214,49 +204,6 @@ class NDBCActor(BasePolicy):
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         return self.forward(observation, deterministic)
-
-
-class LevelCritic(ContinuousCritic):
-    """SB3's critics, stored so that one batched product evaluates them all.
-
-    :param negative: ``Q = logsigmoid(linear output)``, i.e. below zero, for levels whose rewards are never positive
-        (HiTS's ``force_negative``)
-    :param kwargs: arguments of SB3's ``ContinuousCritic``
-    """
-
-    def __init__(self, *, negative: bool = False, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.negative = negative
-        self.activation = kwargs.get("activation_fn", nn.ReLU)()
-
-    def forward(self, obs: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, ...]:
-        """Q-values ``(batch, 1)`` of every critic."""
-        values = super().forward(obs, actions)
-        return tuple(functional.logsigmoid(q) for q in values) if self.negative else values
-
-    def q1_forward(self, obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """Q-value ``(batch, 1)`` of the first critic, without gradient."""
-        value = super().q1_forward(obs, actions)
-        return functional.logsigmoid(value) if self.negative else value
-
-    def blocks(self) -> list[Block]:
-        """Per layer, all critics' weights ``(n_critics, out, in)`` and biases ``(n_critics, 1, out)``."""
-        blocks = []
-        for layers in zip(*(linear_layers(net) for net in self.q_networks), strict=True):
-            weights, biases = tuple(layer.weight for layer in layers), tuple(layer.bias for layer in layers)
-            blocks.append(Block((len(layers), *weights[0].shape), weights))
-            blocks.append(Block((len(layers), 1, *biases[0].shape), biases))
-        return blocks
-
-    def q_blocks(self, blocks: Sequence[th.Tensor], obs: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """All critics' values ``(n_critics, batch, 1)`` as a function of the parameter blocks."""
-        inputs = th.cat((obs, actions), dim=-1)
-        weight, bias = blocks[0], blocks[1]
-        first = functional.linear(inputs, weight.flatten(0, 1), bias.flatten())
-        values = first.view(-1, len(weight), weight.shape[1]).transpose(0, 1)
-        for weight, bias in zip(blocks[2::2], blocks[3::2], strict=True):
-            values = th.baddbmm(bias, self.activation(values), weight.transpose(1, 2))
-        return functional.logsigmoid(values) if self.negative else values
 
 
 class LevelPolicy(SACPolicy):

@@ -10,11 +10,13 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch.fx.experimental.proxy_tensor import make_fx
+from torch.utils._pytree import tree_leaves
 
 from sb3_tbc.level import compilation
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.spaces_only import SpacesOnlyVecEnv
-from sb3_tbc.level.update import FlatParameters, squash
+from sb3_tbc.level.storage import FlatParameters
+from sb3_tbc.level.update import Given, squash
 from sb3_tbc.replay.batch import LevelBatch
 
 OBS_DIM, ACTION_DIM, BATCH, UPDATES = 5, 2, 32, 50
@@ -214,8 +216,9 @@ def test_graph_passes_keep_the_numbers() -> None:
     update = level._update
     batch = level.replay_buffer.sample_burst(1, BATCH)
     noise = level_noise(level, 1)
-    rows = update._schedules(1, 0.01, -2.0)
-    example = [th.zeros(6), level.log_ent_coef.data, *update._state(), *(x[0] for x in (rows, noise, *batch))]
+    inputs = update.example(BATCH, level.log_ent_coef)
+    given = Given(update._schedules(1, 0.01, -2.0)[0], noise[0], (), LevelBatch(*(x[0] for x in batch)))
+    example = tree_leaves(inputs._replace(given=given))
     graph = make_fx(update._step)(*(x.clone() for x in example))
     n_nodes = len(graph.graph.nodes)
     compilation.split_bias_from_products(graph)
