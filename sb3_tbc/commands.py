@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import io
 import shutil
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, TrainingError, WriteError
 
+FAILED = 1
 USER_MISTAKE = 2
 INTERRUPTED = 130
 
@@ -79,12 +81,15 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
     :param argv: arguments, by default those of the process
     :return: exit status
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a path that the terminal cannot show is no reason to fail
     try:
         return command(sys.argv[1:] if argv is None else argv)
-    except ConfigError as error:
+    except (ConfigError, WriteError, TrainingError) as error:
         line = " ".join(str(error).split())
         print(f"{name}: error: {line}", file=sys.stderr)
-        return USER_MISTAKE
+        return FAILED if isinstance(error, TrainingError) else USER_MISTAKE
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -18,6 +18,28 @@ class ConfigError(ValueError):
     """A configuration names what does not exist or has the wrong type; the message names the nearest match."""
 
 
+class WriteError(OSError):
+    """A file or folder cannot be written; what was there before is untouched. The message says where, why, and what
+    to do.
+    """
+
+
+class FolderInUseError(ConfigError):
+    """Another process works in the folder."""
+
+
+class EnvironmentFault(RuntimeError):
+    """An environment raised an error, died or hangs; the message names it and the step."""
+
+
+class DivergedError(ArithmeticError):
+    """Learning left all sense: losses or weights grew without bound."""
+
+
+class TrainingError(RuntimeError):
+    """Training ended early; the message says why, and from where it can go on. The reason is the error's cause."""
+
+
 def nearest(name: str, names: Iterable[str]) -> str:
     """A hint that names the closest valid name, or lists them all when none is close."""
     known = sorted(names)

@@ -1,40 +1,206 @@
-"""Writing files so that neither a reader nor a crash ever meets half of one."""
+"""Writing files so that no reader, crash, full disk or power cut ever leaves half of one."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import hashlib
 import io
 import os
-from collections.abc import Callable, Mapping
+import shutil
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sb3_tbc.errors import FolderInUseError, WriteError
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks: there, two runs in one folder are not noticed
+    fcntl = None  # type: ignore[assignment]
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+TEMPORARY = (".tmp*-*", ".*.tmp", "*.partial")
+"""Names of files that a killed process leaves behind; the second and third are those of earlier versions."""
+LOCK = ".lock"
+
+
+def sync(path: Path) -> None:
+    """Wait until a file's content, or a folder's list of names, is on the disk."""
+    with contextlib.suppress(PermissionError):  # Windows cannot open folders
+        handle = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+
+
+@contextlib.contextmanager
+def explained(path: Path) -> Iterator[None]:
+    """Turn whatever a failed write raises within into a :class:`.WriteError` about ``path``.
+
+    :param path: what is written
+    :raises WriteError: naming the path, the reason and the likely cure
+    """
+    try:
+        yield
+    except WriteError:
+        raise
+    except Exception as error:
+        failure = _system_error(error)
+        if failure is None:
+            raise
+        raise WriteError(f"cannot write {path}: {_reason(failure)}") from error
+
+
+def _system_error(error: BaseException | None) -> OSError | None:
+    """The system's own error behind what torch or NumPy made of it; None if there is none."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None:
+            return error
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _reason(error: OSError) -> str:
+    reason = error.strerror or type(error).__name__
+    if error.errno in FULL:
+        return f"{reason}; make room, then go on"
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        return f"{reason}: {error.filename} is a file where a folder is needed"
+    return f"{reason}; is the folder yours and writable?"
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A temporary path beside ``path``: what is written there takes the place of ``path`` when the block ends well.
+
+    The content is on the disk before it gets its name, and so is the name before this returns.
+
+    :raises WriteError: if it cannot be written; what was at ``path`` is untouched then
+    """
+    with explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
+        try:
+            yield temporary
+            sync(temporary)
+            os.replace(temporary, path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+        sync(path.parent)
+
 
 def write_atomic(path: Path, text: str) -> None:
-    """Write a text file so that a reader or a crash never sees half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
+    """Write a text file so that a reader or a crash never sees half of it; characters no file can hold are escaped.
+
+    :raises WriteError: if it cannot be written
+    """
+    with replacing(path) as temporary:
+        temporary.write_bytes(text.encode("utf-8", errors="backslashreplace"))
 
 
 def save_atomic(save: Callable[[str], object], path: Path) -> None:
-    """Let ``save`` write to a temporary file with the same suffix, then put that in place of ``path``."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
-    save(str(temporary))
-    os.replace(temporary, path)
+    """Let ``save`` write to a temporary file with the same suffix, then put that in place of ``path``.
+
+    :raises WriteError: if it cannot be written
+    """
+    with replacing(path) as temporary:
+        save(str(temporary))
 
 
 def write_arrays(path: str | Path | io.BufferedIOBase, arrays: Mapping[str, Any]) -> None:
-    """Write plain arrays to one file, atomically where ``path`` is a path."""
+    """Write plain arrays to one file, atomically where ``path`` is a path, whose folder is made as SB3 does.
+
+    :raises WriteError: if it cannot be written
+    """
     content: dict[str, Any] = dict(arrays)
     if not isinstance(path, (str, Path)):
         np.savez(path, **content)
         return
-    target = Path(path)
-    partial = target.with_name(target.name + ".partial")
-    with open(partial, "wb") as file:
+    with replacing(Path(path)) as temporary, open(temporary, "wb") as file:
         np.savez(file, **content)
-    os.replace(partial, target)
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file, as hexadecimal text."""
+    total = hashlib.sha256()
+    with path.open("rb") as file:
+        while block := file.read(1 << 20):
+            total.update(block)
+    return total.hexdigest()
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder with all that is in it, if it is there."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def remove_temporary(folder: Path) -> None:
+    """Remove what killed processes left half written in a folder."""
+    for pattern in TEMPORARY:
+        for path in folder.glob(pattern):
+            remove(path)
+
+
+@contextlib.contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold a folder, made if need be, for this process alone.
+
+    The lock ends with the process, however that ends, so there are no stale ones.
+
+    :raises FolderInUseError: if another process holds it
+    :raises WriteError: if the folder cannot be made or written to
+    """
+    with explained(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        handle = _take(folder / LOCK)
+    try:
+        yield
+    finally:
+        (folder / LOCK).unlink(missing_ok=True)
+        os.close(handle)
+
+
+def _take(path: Path) -> int:
+    """A handle that holds the lock; the file must still have its name then, or its holder has just let go of it."""
+    while True:
+        handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            _lock(handle, path)
+            if _same_file(handle, path):
+                os.truncate(handle, 0)
+                os.write(handle, f"{os.getpid()}\n".encode())
+                return handle
+        except BaseException:
+            os.close(handle)
+            raise
+        os.close(handle)
+
+
+def _lock(handle: int, path: Path) -> None:
+    if fcntl is None:
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        holder = os.read(handle, 32).decode(errors="replace").strip() or "unknown"
+        raise FolderInUseError(
+            f"{path.parent} is in use by process {holder}; wait until it ends, or use another --variant or --log-folder"
+        ) from error
+    except OSError as error:
+        if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):  # file systems without locks
+            raise
+
+
+def _same_file(handle: int, path: Path) -> bool:
+    try:
+        return os.path.samestat(os.fstat(handle), path.stat())
+    except FileNotFoundError:
+        return False

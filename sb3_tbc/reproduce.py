@@ -38,7 +38,7 @@ class Job:
     def command(self) -> list[str]:
         """The training command that begins this run, or goes on where it stopped."""
         train = [sys.executable, "-m", "sb3_tbc.train", "--no-progress"]
-        if self.folder.exists and (self.folder.checkpoint / "state.json").is_file():
+        if self.folder.resumable:
             return [*train, "--resume", str(self.folder.path)]
         return [*train, "--overwrite", *self.arguments]
 

@@ -12,9 +12,10 @@ from typing import Any
 
 import torch as th
 
-from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
+from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm
 from sb3_tbc.zoo.config import CONFIGS, load_config, parse_overrides
@@ -161,8 +162,12 @@ def command(argv: Sequence[str]) -> int:
     args = build_parser().parse_args(argv)
     if args.tensorboard:  # told before the run's folder is made
         require("tensorboard", extra="plots", what="--tensorboard")
+    with stop_request() as stop:
+        return _train(args, argv, stop)
+
+
+def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> int:
     th.set_num_threads(args.num_threads)
-    stop_like_ctrl_c()
     options = RunOptions(
         device=args.device,
         progress=sys.stderr.isatty() if args.progress is None else args.progress,
@@ -170,11 +175,13 @@ def command(argv: Sequence[str]) -> int:
         trace=args.trace,
         checkpoint_seconds=60.0 * args.checkpoint_minutes,
         keep_checkpoint=args.keep_checkpoint,
+        stop=stop,
     )
     try:
         folder, result = _run(args, options, argv)
     except Interrupted as stopped:
-        print(f"\n{stopped}; continue with: python -m sb3_tbc.train --resume {stopped.folder}", file=sys.stderr)
+        where = shlex.quote(str(stopped.folder))
+        print(f"{stopped}; continue with: python -m sb3_tbc.train --resume {where}", file=sys.stderr)
         return INTERRUPTED
     print(describe(result, folder))
     if args.ledger is not None:

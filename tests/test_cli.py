@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -177,8 +178,10 @@ def test_resume_without_a_checkpoint(run: RunFolder, tmp_path: Path, capsys: pyt
     assert "holds no run" in said(capsys)
     copy = RunFolder(tmp_path / "seed_5")
     shutil.copytree(run.path, copy.path)
-    assert train.main(["--resume", str(copy.path)]) == 2
-    assert "is at 400 of 400 steps; raise --n-timesteps" in said(capsys)
+    assert train.main(["--resume", str(copy.path)]) == 0  # there is nothing left to do
+    assert "success rate" in capsys.readouterr().out
+    assert train.main(["--resume", str(copy.path), "--n-timesteps", "300"]) == 2
+    assert "is at 400 of 300 steps already; raise --n-timesteps" in said(capsys)
     shutil.rmtree(copy.checkpoint)
     assert train.main(["--resume", str(copy.path), "--n-timesteps", "600"]) == 2
     assert "has no checkpoint" in said(capsys)
@@ -192,8 +195,8 @@ def test_ctrl_c_saves_and_resume_finishes(
     original = SuccessEvalCallback._on_step
 
     def interrupt(self: SuccessEvalCallback) -> bool:
-        if self.num_timesteps == 150:
-            raise KeyboardInterrupt
+        if self.num_timesteps in (150, 151):  # an impatient second Ctrl-C must not lose what the first one saves
+            signal.raise_signal(signal.SIGINT)
         return original(self)
 
     monkeypatch.setattr(SuccessEvalCallback, "_on_step", interrupt)

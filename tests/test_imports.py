@@ -14,7 +14,8 @@ PACKAGE = ROOT / "sb3_tbc"
 
 # From bottom to top: a folder (or a module beside the folders) imports from itself and from lower layers alone.
 LAYERS = (
-    ("former_names", "errors", "stats", "files", "arrays"),
+    ("former_names", "errors", "stats", "arrays"),
+    ("files", "outside", "stopping"),
     ("commands", "extras", "smdp"),
     ("replay", "ndbc", "tasks", "zoo_configs"),
     ("level",),

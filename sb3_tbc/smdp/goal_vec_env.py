@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_tbc.smdp.faults import fault
 from sb3_tbc.smdp.spaces import GoalObservation
 
 
@@ -69,14 +70,20 @@ class GoalVecEnv(DummyVecEnv):
         infos: list[dict[str, Any]] = []
         for index, env in enumerate(self.envs):
             action = self.actions[index]
-            observation, self.buf_rews[index], terminated, truncated, given = env.step(action)
+            try:
+                observation, self.buf_rews[index], terminated, truncated, given = env.step(action)
+            except Exception as error:
+                raise fault(index, len(self.running[index].actions) + 1, error) from error
             self.running[index].actions.append(action)
             info = {**given, "TimeLimit.truncated": truncated and not terminated}
             over = self.buf_dones[index] = terminated or truncated
             if over:
                 info["terminal_observation"] = observation
                 self._note_start(index, None)
-                observation, self.reset_infos[index] = env.reset()
+                try:
+                    observation, self.reset_infos[index] = env.reset()
+                except Exception as error:
+                    raise fault(index, 0, error) from error
             for key, array in self.buf_obs.items():
                 array[index] = observation[key]
             infos.append(info)

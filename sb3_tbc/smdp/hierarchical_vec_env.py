@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.errors import HierarchyError
+from sb3_tbc.smdp.faults import step_or_name
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, width
 from sb3_tbc.smdp.options import Episode, OptionClock, OptionRules, TerminationReason
 from sb3_tbc.smdp.recorder import EpisodeRecorder
@@ -166,7 +167,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self._recorder.before_step(
             unit, no_memory if states is None else states, no_memory if next_states is None else next_states
         )
-        observation, task_rewards, dones, infos = self.venv.step(actions)
+        observation, task_rewards, dones, infos = step_or_name(self.venv, actions, self._recorder.steps)
         seen = self._before_reset(observation, dones, infos)  # type: ignore[arg-type]
         self._recorder.after_step(task_rewards, seen)
         self.clock.tick()

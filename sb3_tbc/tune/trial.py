@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import os
 import socket
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import optuna
 from optuna.trial import Trial, TrialState
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter
 
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, EnvironmentFault, TrainingError
 from sb3_tbc.tune.objectives import ACROSS, OBJECTIVES
 from sb3_tbc.tune.pruning import SEED_VALUES, SeedPruner
 from sb3_tbc.tune.search_space import suggest
@@ -25,14 +22,12 @@ from sb3_tbc.zoo.callbacks import EvaluationRow, SuccessEvalCallback
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, start_run
+from sb3_tbc.zoo.safety import LossWatch
 
 CURVES = "curves"
 """Trial attribute: seed -> the reports made during its run, so that a retried trial need not train it again."""
 DIVERGED = 1e6
 """Critic loss at which a run counts as diverging; returns here are of the order of 10 to 100, so losses of 1e4."""
-
-NOT_A_DISTRIBUTION = "to satisfy the constraint"
-"""How torch says that an actor's mean is NaN."""
 
 
 class Surplus(Exception):
@@ -41,22 +36,6 @@ class Surplus(Exception):
 
 class Stopped(Exception):
     """The user stopped the search within a trial."""
-
-
-class LossWatch(KVWriter):
-    """Reads what the agent logs and remembers the first sign of divergence."""
-
-    def __init__(self) -> None:
-        self.reason = ""
-
-    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """Look at the critics' losses of one dump."""
-        for key, value in key_values.items():
-            if key.endswith("critic_loss") and not (math.isfinite(value) and abs(value) < DIVERGED) and not self.reason:
-                self.reason = f"diverging: {key} is {value:.3g} at step {step:,}"
-
-    def close(self) -> None:
-        """Nothing to close."""
 
 
 class ReportCallback(BaseCallback):
@@ -68,7 +47,7 @@ class ReportCallback(BaseCallback):
     def __init__(self, report: Callable[[list[EvaluationRow]], None]) -> None:
         super().__init__()
         self.report = report
-        self.watch = LossWatch()
+        self.watch = LossWatch(DIVERGED)
 
     def _init_callback(self) -> None:
         self.logger.output_formats.append(self.watch)
@@ -159,13 +138,11 @@ class TrialRunner:
         command = f"python -m sb3_tbc.tune: study {trial.study.study_name}, trial {trial.number}, seed {seed}"
         try:
             result = start_run(spec, folder, command, self.options, True, ReportCallback(report))
-        except FloatingPointError as error:
-            raise optuna.TrialPruned(f"not finite: {error} (seed {seed})") from error
-        except ValueError as error:
-            if not isinstance(error, ConfigError):
-                if NOT_A_DISTRIBUTION in str(error):  # SB3's own SAC does not look at its weights
-                    raise optuna.TrialPruned(f"not finite: the actor's distribution (seed {seed})") from error
+        except TrainingError as error:
+            if isinstance(error.__cause__, EnvironmentFault):
                 raise
+            raise optuna.TrialPruned(f"not finite: {error.__cause__} (seed {seed})") from error
+        except ConfigError as error:
             if trial.user_attrs.get(ORIGIN):
                 raise
             raise optuna.TrialPruned(f"refused: {error}") from error

@@ -83,7 +83,7 @@ def load(job: Job, index: int) -> tuple[Study, TrialRunner]:
     study.sampler = make_sampler(job.sampler, job.seed, (index, len(study.get_trials(deepcopy=False))))
     study.pruner = make_pruner(job.pruner, settings.n_evaluations, settings.n_seeds)
     resolve_env(settings.env)  # imports the module that registers it
-    options = RunOptions(device=job.device, verbose=0, checkpoint_seconds=math.inf)
+    options = RunOptions(device=job.device, verbose=0, checkpoint_seconds=math.inf, save_at_end=False)
     return study, TrialRunner(settings, job.folder, job.n_trials, options, partial(_say, index))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -15,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.files import explained, replacing, save_atomic, write_atomic
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
@@ -159,10 +160,10 @@ class SuccessEvalCallback(EventCallback):
             self.logger.record(f"eval/{name}", getattr(row, name))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
-        if self.csv_path is not None:
-            write_evaluations(self.csv_path, self.rows)
         if is_best and self.best_model_path is not None:
             save_atomic(self.model.save, self.best_model_path)
+        if self.csv_path is not None:  # after the agent that it may call the best
+            write_evaluations(self.csv_path, self.rows)
         if is_best and self.callback_on_new_best is not None:
             self.callback_on_new_best.on_step()
         if self.verbose:
@@ -180,9 +181,11 @@ def _quality(row: EvaluationRow) -> tuple[float, float]:
 class OptionTraceCallback(BaseCallback):
     """Writes every option of training to a CSV: when, where, subgoal, time budget, duration, reason of its end.
 
-    :param path: the CSV file; begun anew
-    :param every: write every ``every``-th option only, which keeps the file small
+    :param path: the CSV file; what it holds of the steps before training begins is kept, as a resumed run needs it
+    :param every: keep one option in so many, to bound the file's size
     """
+
+    HEADER = ("timesteps", "env", "time_budget", "duration", "reached", "reason", "subgoal")
 
     def __init__(self, path: Path, every: int = 1, verbose: int = 0) -> None:
         super().__init__(verbose)
@@ -194,10 +197,9 @@ class OptionTraceCallback(BaseCallback):
         self._file: io.TextIOWrapper | None = None
 
     def _on_training_start(self) -> None:
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._file = self.path.open("w", encoding="utf-8", newline="")
-        header = ("timesteps", "env", "time_budget", "duration", "reached", "reason", "subgoal")
-        csv.writer(self._file, lineterminator="\n").writerow(header)
+        keep_trace(self.path, self.HEADER, self.num_timesteps)
+        with explained(self.path):
+            self._file = self.path.open("a", encoding="utf-8", newline="")
 
     def _on_step(self) -> bool:
         for index, info in enumerate(self.locals.get("infos", ())):
@@ -215,7 +217,15 @@ class OptionTraceCallback(BaseCallback):
         subgoal = " ".join(f"{x:.4g}" for x in option["subgoal"])
         row = [self.num_timesteps, index, f"{option['time_budget']:.4g}", option["duration"]]
         row += [int(option["reached"]), option["reason"], subgoal]
-        csv.writer(self._file, lineterminator="\n").writerow(row)
+        with explained(self.path):
+            csv.writer(self._file, lineterminator="\n").writerow(row)
+
+    def flush(self) -> None:
+        """Put what was written on the disk: a checkpoint that is to be resumed from needs the options before it."""
+        if self._file is not None:
+            with explained(self.path):
+                self._file.flush()
+                os.fsync(self._file.fileno())
 
     def _on_training_end(self) -> None:
         if self._file is not None:
@@ -223,23 +233,48 @@ class OptionTraceCallback(BaseCallback):
             self._file = None
 
 
+def keep_trace(path: Path, header: tuple[str, ...], timesteps: int) -> None:
+    """Leave in a trace what happened up to a step, whole lines only; without a file, begin one."""
+    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as kept:
+        csv.writer(kept, lineterminator="\n").writerow(header)
+        if not timesteps or not path.is_file():
+            return
+        with path.open(encoding="utf-8", errors="replace", newline="") as earlier:
+            for line in earlier:
+                steps = line.partition(",")[0]
+                if line.endswith("\n") and steps.isdecimal() and int(steps) <= timesteps:
+                    kept.write(line)
+
+
+class StopTraining(Exception):
+    """The user asked to stop, and training is at a point from which it can go on exactly."""
+
+
 class TimedCheckpointCallback(BaseCallback):
-    """Calls ``save`` every so many seconds, between rollouts, when no option is half recorded.
+    """Calls ``save`` every so many seconds, between rollouts, when no option is half recorded; stops there when asked.
 
     :param save: writes the checkpoint
     :param seconds: shortest time between two checkpoints
+    :param stop: whether the user asked to stop; :class:`StopTraining` ends training then, before anything is collected
     """
 
-    def __init__(self, save: Callable[[], None], seconds: float = 600.0, verbose: int = 0) -> None:
+    def __init__(
+        self,
+        save: Callable[[], None],
+        seconds: float = 600.0,
+        stop: Callable[[], bool] = bool,
+        verbose: int = 0,
+    ) -> None:
         super().__init__(verbose)
-        self.save = save
-        self.seconds = seconds
+        self.save, self.seconds, self.stop = save, seconds, stop
         self._last = time.monotonic()
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
+        if self.stop():
+            raise StopTraining
         if time.monotonic() - self._last >= self.seconds:
             self.save()
             self._last = time.monotonic()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import platform
-import shutil
 import subprocess
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -19,9 +18,11 @@ import yaml
 from numpy.typing import NDArray
 
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.files import write_atomic
+from sb3_tbc.files import remove, remove_temporary, write_atomic
+from sb3_tbc.outside import flat_name, folder_name
 from sb3_tbc.stats import stability, wilson_interval
 from sb3_tbc.zoo.callbacks import EvaluationRow, finite_mean, read_evaluations, write_evaluations
+from sb3_tbc.zoo.checkpoints import NEWEST, has_checkpoint, remove_checkpoints, remove_unfinished
 
 CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL = (
     "config.yml",
@@ -142,8 +143,12 @@ class RunFolder:
 
     @classmethod
     def of(cls, root: Path, task: str, algo: str, variant: str, seed: int) -> RunFolder:
-        """The folder a run belongs in; slashes and colons of environment ids become underscores."""
-        return cls(root / task.replace("/", "_").replace(":", "_") / algo / variant / f"seed_{seed}")
+        """The folder a run belongs in; slashes and colons of environment ids become underscores.
+
+        :raises ConfigError: if a name would lead out of ``root`` or is no name of a folder
+        """
+        names = flat_name(task, "the task"), folder_name(algo, "the algorithm"), folder_name(variant, "the variant")
+        return cls(root.joinpath(*names, folder_name(f"seed_{seed}", "the seed")))
 
     @property
     def model(self) -> Path:
@@ -157,8 +162,8 @@ class RunFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """Folder with what ``--resume`` needs."""
-        return self.path / "checkpoint"
+        """Folder with what ``--resume`` needs; the one before lies beside it, see :mod:`.checkpoints`."""
+        return self.path / NEWEST
 
     @property
     def evaluations(self) -> Path:
@@ -175,17 +180,34 @@ class RunFolder:
         """Whether a run has ended here."""
         return (self.path / FINAL).is_file()
 
+    @property
+    def resumable(self) -> bool:
+        """Whether there is an unfinished run that ``--resume`` goes on with."""
+        return self.exists and not self.finished and (has_checkpoint(self.path) or self.model.is_file())
+
     def start(self, config: Mapping[str, Any], command: str) -> None:
-        """Write what is known before training: configuration, command, versions."""
-        write_atomic(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
-        write_atomic(self.path / COMMAND, command + "\n")
+        """Write what is known before training: versions, command, and the configuration, which makes it a run."""
         write_atomic(self.path / VERSIONS, to_json(versions()))
+        write_atomic(self.path / COMMAND, command + "\n")
+        write_atomic(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
 
     def clear(self) -> None:
-        """Remove the files of an earlier run, and nothing else that may lie in the folder."""
-        for name in (*LEDGER_FILES, self.model.name, self.best_model.name, "progress.csv", "options.csv"):
+        """Remove the files of an earlier run, and nothing else that may lie in the folder.
+
+        First it stops to be a result, then a run, so that no half of it is ever taken for one.
+        """
+        for name in (FINAL, CONFIG):
             (self.path / name).unlink(missing_ok=True)
-        shutil.rmtree(self.checkpoint, ignore_errors=True)
+        remove_checkpoints(self.path)
+        self.tidy()
+        rest = (COMMAND, VERSIONS, EVALUATIONS, self.model.name, self.best_model.name, "progress.csv", "options.csv")
+        for path in (*(self.path / name for name in rest), *self.path.glob("*_until_*")):
+            remove(path)
+
+    def tidy(self) -> None:
+        """Remove what killed processes left half written."""
+        remove_unfinished(self.path)
+        remove_temporary(self.path)
 
     def read_config(self) -> dict[str, Any]:
         """The configuration the run was started with.
@@ -205,17 +227,34 @@ class RunFolder:
         """The learning curve, empty before the first evaluation."""
         return read_evaluations(self.evaluations)
 
+    @property
+    def command_line(self) -> str:
+        """The command the run was started with; empty if it is not known."""
+        path = self.path / COMMAND
+        return path.read_text(encoding="utf-8", errors="replace").strip() if path.is_file() else ""
+
+    def reopen(self, timesteps: int) -> None:
+        """Put aside what a run that goes on from this step writes anew; a result that it had stays under its step."""
+        if self.finished:
+            self._put_aside(FINAL, timesteps)
+        self.drop_evaluations_after(timesteps)
+        self._put_aside("progress.csv", timesteps)  # SB3 begins it anew
+
+    def _put_aside(self, name: str, timesteps: int) -> None:
+        stem, _, suffix = name.partition(".")
+        aside = self.path / f"{stem}_until_{timesteps}.{suffix}"
+        for k in range(2, 10_000):
+            if not aside.exists():
+                break
+            aside = self.path / f"{stem}_until_{timesteps}_{k}.{suffix}"  # an earlier part ended at the same step
+        if (self.path / name).is_file():
+            (self.path / name).rename(aside)
+
     def drop_evaluations_after(self, timesteps: int) -> None:
         """Forget evaluations that a resumed run will make again."""
         rows = self.read_evaluations()
         if any(row.timesteps > timesteps for row in rows):
             write_evaluations(self.evaluations, [row for row in rows if row.timesteps <= timesteps])
-
-    def keep_progress(self, timesteps: int) -> None:
-        """Put SB3's ``progress.csv`` aside before a resumed run begins another."""
-        progress = self.path / "progress.csv"
-        if progress.is_file():
-            progress.rename(self.path / f"progress_until_{timesteps}.csv")
 
     def finish(self, result: Mapping[str, Any]) -> None:
         """Write the result, which marks the run as done."""

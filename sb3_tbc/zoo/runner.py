@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
-import math
-import os
-import shutil
-from dataclasses import asdict, dataclass, replace
+import shlex
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +12,25 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.errors import ConfigError
-from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.errors import (
+    ConfigError,
+    DivergedError,
+    EnvironmentFault,
+    NonFiniteError,
+    TrainingError,
+    WriteError,
+)
+from sb3_tbc.files import explained, locked, save_atomic
+from sb3_tbc.outside import one_line
+from sb3_tbc.stopping import StopRequest
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
-from sb3_tbc.zoo.algorithms import RUN_INFO, Agent, build_model, load_model
-from sb3_tbc.zoo.callbacks import OptionTraceCallback, SuccessEvalCallback, TimedCheckpointCallback
+from sb3_tbc.zoo.algorithms import RUN_INFO, Agent, build_model, load_model, read_zip
+from sb3_tbc.zoo.callbacks import OptionTraceCallback, StopTraining, SuccessEvalCallback, TimedCheckpointCallback
+from sb3_tbc.zoo.checkpoints import find_checkpoint, keep_only, remove_checkpoints, save_checkpoint
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.environments import make_envs
-from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise, to_json
+from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise
+from sb3_tbc.zoo.safety import CURE, ConsistentState, DivergenceCallback, check_weights
 
 
 def evaluation_seed(seed: int) -> int:
@@ -103,8 +112,10 @@ class RunOptions:
     :param verbose: print a line per evaluation
     :param tensorboard: write TensorBoard files into the run folder
     :param trace: write ``options.csv``
-    :param checkpoint_seconds: time between checkpoints; infinite for none, not even when stopped
+    :param checkpoint_seconds: time between checkpoints; infinite for none, but for the one when stopped
     :param keep_checkpoint: keep the last checkpoint (with replay buffers) of a finished run
+    :param save_at_end: save a checkpoint when training is stopped, or ended by a fault of an environment
+    :param stop: tells whether the user asked to stop; training stops at the next point to go on from
     """
 
     device: str = "cpu"
@@ -114,6 +125,8 @@ class RunOptions:
     trace: bool = False
     checkpoint_seconds: float = 600.0
     keep_checkpoint: bool = False
+    save_at_end: bool = True
+    stop: StopRequest = field(default_factory=StopRequest)
 
 
 def evaluation_envs(env_id: str, n_episodes: int, seed: int, env_kwargs: dict[str, Any]) -> VecEnv:
@@ -122,7 +135,7 @@ def evaluation_envs(env_id: str, n_episodes: int, seed: int, env_kwargs: dict[st
 
 
 class Interrupted(Exception):
-    """Training was stopped by the user; the checkpoint is written to ``folder``."""
+    """Training was stopped by the user; what it goes on from lies in ``folder``."""
 
     def __init__(self, message: str, folder: Path) -> None:
         super().__init__(message)
@@ -141,112 +154,234 @@ def start_run(
 
     :param after_eval: called after each evaluation, e.g. by a search that may give the run up
     :raises ConfigError: for a user's mistake, before anything is written, and if the folder holds a run
-    :raises Interrupted: after Ctrl-C, when the checkpoint is written
+    :raises WriteError: if the folder cannot be written, or the disk is full
+    :raises Interrupted: when stopped, after the checkpoint is written
+    :raises TrainingError: if an environment fails or learning diverges
     """
-    if folder.exists and not overwrite:
-        state = "a finished run" if folder.finished else "an unfinished run"
-        cure = "--overwrite, --variant NAME or another --log-folder" + (
-            "" if folder.finished else f", or --resume {folder.path}"
-        )
-        raise ConfigError(f"{folder.path} holds {state}; nothing was changed. Use {cure}")
+    _check_new(folder, overwrite)
     env = make_envs(spec.env_id, spec.run.n_envs, spec.seed, spec.run.env_kwargs)
     try:
         model = build_model(spec.run, env, spec.seed, device=options.device)
-        folder.clear()
-        folder.start(spec.to_dict(), command)
-        return _learn(model, spec, folder, options, earlier=0.0, after_eval=after_eval)
+        with locked(folder.path):
+            _check_new(folder, overwrite)
+            with explained(folder.path):
+                folder.clear()
+            folder.start(spec.to_dict(), command)
+            return Training(model, spec, folder, options, 0.0, after_eval).run()
     finally:
         env.close()
+
+
+def _check_new(folder: RunFolder, overwrite: bool) -> None:
+    if folder.exists and not overwrite:
+        state = "a finished run" if folder.finished else "an unfinished run"
+        cure = "--overwrite, --variant NAME or another --log-folder"
+        cure += "" if folder.finished else f", or --resume {shlex.quote(str(folder.path))}"
+        raise ConfigError(f"{folder.path} holds {state}; nothing was changed. Use {cure}")
 
 
 def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None = None) -> dict[str, Any]:
-    """Go on from the last checkpoint of a run.
+    """Go on from the last whole checkpoint of a run, or evaluate it where only that was left to do.
+
+    A finished run has nothing left to do: its result is returned, so that a script may resume until all is done.
 
     :param n_timesteps: a new total of environment steps
     :raises ConfigError: if there is no checkpoint or nothing is left to do
+    :raises WriteError: if the folder cannot be written, or the disk is full
+    :raises Interrupted: when stopped, after the checkpoint is written
+    :raises TrainingError: if an environment fails or learning diverges
     """
     spec = RunSpec.from_dict(folder.read_config())
+    if folder.finished and n_timesteps in (None, spec.run.n_timesteps):
+        return folder.read_final()
     if n_timesteps is not None:
         spec = replace(spec, run=replace(spec.run, n_timesteps=n_timesteps))
-    _mend_checkpoint(folder)
-    state_file = folder.checkpoint / "state.json"
-    if not state_file.is_file():
-        cure = (
-            "start with --keep-checkpoint to go on after the end"
-            if folder.finished
-            else "start it again with --overwrite"
-        )
-        raise ConfigError(f"{folder.path} has no checkpoint to resume from; {cure}")
-    state = json.loads(state_file.read_text(encoding="utf-8"))
-    if state["timesteps"] >= spec.run.n_timesteps:
-        raise ConfigError(
-            f"{folder.path} is at {state['timesteps']} of {spec.run.n_timesteps} steps; raise --n-timesteps"
-        )
-    env = make_envs(spec.env_id, spec.run.n_envs, spec.seed + state["timesteps"], spec.run.env_kwargs)
+    with locked(folder.path):
+        with explained(folder.path):
+            folder.tidy()
+        if not folder.finished and _trained(folder) >= spec.run.n_timesteps:
+            return _only_evaluate(spec, folder, options)
+        return _go_on(spec, folder, options)
+
+
+def _trained(folder: RunFolder) -> int:
+    """Steps of the agent at the end of training; 0 where training has not ended."""
+    if not folder.model.is_file():
+        return 0
     try:
-        model = load_model(folder.checkpoint / "model.zip", env, options.device)
-        model.load_replay_buffer(folder.checkpoint / "replay_buffer.pkl")
-        folder.drop_evaluations_after(state["timesteps"])
-        folder.keep_progress(state["timesteps"])
-        folder.start(spec.to_dict(), (folder.path / "command.txt").read_text(encoding="utf-8").strip())
-        return _learn(model, spec, folder, options, earlier=state["wall_time"])
+        steps = read_zip(folder.model).get("num_timesteps")
+    except ConfigError:  # damaged: training goes on from its checkpoint
+        return 0
+    return steps if isinstance(steps, int) else 0
+
+
+def _only_evaluate(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dict[str, Any]:
+    """Finish a run that ended between training and its result."""
+    env = make_envs(spec.env_id, spec.run.n_envs, spec.seed, spec.run.env_kwargs)
+    try:
+        model = load_model(folder.model, env, options.device)
+    finally:
+        env.close()
+    rows = folder.read_evaluations()
+    return finish(model, spec, folder, options, rows[-1].wall_time if rows else 0.0)
+
+
+def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dict[str, Any]:
+    checkpoint = find_checkpoint(folder.path)
+    if checkpoint is None:
+        again = "start with --keep-checkpoint to go on after the end"
+        cure = again if folder.finished else "start it again with --overwrite"
+        raise ConfigError(f"{folder.path} has no checkpoint to resume from; {cure}")
+    done = checkpoint.timesteps
+    if done > spec.run.n_timesteps:
+        raise ConfigError(f"{folder.path} is at {done} of {spec.run.n_timesteps} steps already; raise --n-timesteps")
+    env = make_envs(spec.env_id, spec.run.n_envs, spec.seed + done, spec.run.env_kwargs)
+    try:
+        model = load_model(checkpoint.model, env, options.device)
+        model.load_replay_buffer(checkpoint.replay_buffer)
+        keep_only(folder.path, checkpoint)
+        with explained(folder.path):
+            folder.reopen(done)
+        folder.start(spec.to_dict(), folder.command_line)
+        return Training(model, spec, folder, options, checkpoint.wall_time).run()
     finally:
         env.close()
 
 
-def _learn(
-    model: Agent,
-    spec: RunSpec,
-    folder: RunFolder,
-    options: RunOptions,
-    earlier: float,
-    after_eval: BaseCallback | None = None,
-) -> dict[str, Any]:
-    setattr(model, RUN_INFO, spec.identity)
-    formats = ["csv", "tensorboard"] if options.tensorboard else ["csv"]
-    model.set_logger(configure(str(folder.path), formats))
-    eval_env = evaluation_envs(spec.env_id, spec.n_eval_episodes, evaluation_seed(spec.seed), spec.run.env_kwargs)
-    evaluations = SuccessEvalCallback(
-        eval_env,
-        spec.eval_freq,
-        spec.n_eval_episodes,
-        seed=evaluation_seed(spec.seed),
-        csv_path=folder.evaluations,
-        best_model_path=folder.best_model,
-        wall_time=earlier,
-        callback_after_eval=after_eval,
-        verbose=options.verbose,
-    )
+class Training:
+    """Training of an agent into a run's folder, whatever happens.
 
-    def checkpoint() -> None:
-        _save_checkpoint(model, folder, evaluations.wall_time)
+    :param earlier: seconds that earlier parts of the run took
+    :param after_eval: called after each evaluation
+    """
 
-    callbacks: list[BaseCallback] = [evaluations, TimedCheckpointCallback(checkpoint, options.checkpoint_seconds)]
-    if options.trace:
-        callbacks.append(OptionTraceCallback(folder.path / "options.csv"))
-    try:
+    def __init__(
+        self,
+        model: Agent,
+        spec: RunSpec,
+        folder: RunFolder,
+        options: RunOptions,
+        earlier: float,
+        after_eval: BaseCallback | None = None,
+    ) -> None:
+        self.model, self.spec, self.folder, self.options = model, spec, folder, options
+        self.earlier, self.after_eval = earlier, after_eval
+        self.trace = OptionTraceCallback(folder.path / "options.csv") if options.trace else None
+        self.consistent = ConsistentState()
+
+    def run(self) -> dict[str, Any]:
+        """Train, evaluate, write the result, and return it.
+
+        :raises Interrupted: when stopped
+        :raises TrainingError: if an environment fails or learning diverges
+        :raises WriteError: if something cannot be written
+        """
+        model, spec, seed = self.model, self.spec, evaluation_seed(self.spec.seed)
+        setattr(model, RUN_INFO, spec.identity)
+        with explained(self.folder.path):
+            model.set_logger(configure(str(self.folder.path), ["csv", *["tensorboard"] * self.options.tensorboard]))
+        env = evaluation_envs(spec.env_id, spec.n_eval_episodes, seed, spec.run.env_kwargs)
+        self.evaluations = SuccessEvalCallback(
+            env, spec.eval_freq, spec.n_eval_episodes, seed=seed, csv_path=self.folder.evaluations,
+            best_model_path=self.folder.best_model, wall_time=self.earlier, callback_after_eval=self.after_eval,
+            verbose=self.options.verbose,
+        )  # fmt: skip
         try:
-            _train(model, spec.run.n_timesteps, CallbackList(callbacks), options.progress)
-        except KeyboardInterrupt as error:
-            if math.isfinite(options.checkpoint_seconds):
-                checkpoint()
-            message = f"stopped at {model.num_timesteps} of {spec.run.n_timesteps} steps"
-            raise Interrupted(message, folder.path) from error
-        save_atomic(model.save, folder.model)
-        result = _final(model, spec, folder, evaluations.wall_time)
-    finally:
-        eval_env.close()
-    if options.keep_checkpoint:
-        checkpoint()
-    else:
-        shutil.rmtree(folder.checkpoint, ignore_errors=True)
+            self._train()
+        finally:
+            env.close()
+        check_weights(model)
+        if self.options.keep_checkpoint:
+            self.checkpoint()
+        save_atomic(model.save, self.folder.model)
+        if self.options.stop:
+            raise Interrupted(f"stopped after all {model.num_timesteps} steps, before the result", self.folder.path)
+        return finish(model, spec, self.folder, self.options, self.evaluations.wall_time)
+
+    def checkpoint(self, save_replay: Callable[[Path], object] | None = None) -> None:
+        """Save all that the run goes on from."""
+        check_weights(self.model)
+        if self.trace is not None:
+            self.trace.flush()
+        steps, replay = int(self.model.num_timesteps), save_replay or self.model.save_replay_buffer
+        save_checkpoint(self.folder.path, steps, self.evaluations.wall_time, self.model.save, replay)
+
+    def _train(self) -> None:
+        """Learn; whatever ends that early is told in one line, with what there is to go on from."""
+        options, wanted = self.options, self.spec.run.n_timesteps
+        callbacks = [
+            DivergenceCallback(),
+            self.evaluations,
+            TimedCheckpointCallback(self.checkpoint, options.checkpoint_seconds, lambda: bool(options.stop)),
+            self.consistent,
+            *([self.trace] if self.trace else []),
+        ]
+        left, fresh = wanted - self.model.num_timesteps, self.model.num_timesteps == 0
+        try:
+            self.model.learn(
+                left, callback=CallbackList(callbacks), reset_num_timesteps=fresh, progress_bar=options.progress
+            )
+        except StopTraining as stop:
+            if options.save_at_end:
+                self.checkpoint()
+            raise Interrupted(f"stopped at {self.model.num_timesteps} of {wanted} steps", self.folder.path) from stop
+        except OSError as error:  # SB3's progress.csv raises the system's own
+            told = error if isinstance(error, WriteError) else f"cannot write {self.folder.path}: {error.strerror}"
+            raise WriteError(f"{told}. {self._what_is_left()}") from error
+        except EnvironmentFault as error:
+            raise self._ended(error, self._save_before()) from error
+        except (NonFiniteError, DivergedError, ValueError) as error:
+            self._told(error)
+
+    def _told(self, error: NonFiniteError | DivergedError | ValueError) -> None:
+        if NOT_A_DISTRIBUTION in str(error):  # SB3's own SAC does not look at its weights
+            error = NonFiniteError(f"the actor's actions became NaN or infinite; {CURE}")
+        if isinstance(error, ValueError):
+            raise error
+        raise self._ended(error, self._save_before()) from error
+
+    def _ended(self, error: Exception, saved: bool = False) -> TrainingError:
+        step, wanted = self.model.num_timesteps, self.spec.run.n_timesteps
+        return TrainingError(
+            f"training ended at step {step} of {wanted}: {one_line(error, 1000)}. {self._what_is_left(saved)}"
+        )
+
+    def _save_before(self) -> bool:
+        """Save the last point to go on from, if nothing has been learned since; whether that was done."""
+        replay = self.consistent.go_back() if self.options.save_at_end else None
+        if replay is None:
+            return False
+        try:
+            self.checkpoint(replay)
+        except (DivergedError, WriteError):
+            return False
+        return True
+
+    def _what_is_left(self, saved: bool = False) -> str:
+        if not self.options.save_at_end:
+            return ""
+        checkpoint = find_checkpoint(self.folder.path)
+        if checkpoint is None:
+            return "No checkpoint had been written yet"
+        how = "Saved" if saved else "The last checkpoint is"
+        resume = f"python -m sb3_tbc.train --resume {shlex.quote(str(self.folder.path))}"
+        return f"{how} at step {checkpoint.timesteps}; continue with: {resume}"
+
+
+NOT_A_DISTRIBUTION = "to satisfy the constraint"
+"""How torch says that an actor's mean is NaN."""
+
+
+def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, trained: float) -> dict[str, Any]:
+    """Evaluate the trained agent, write the result, and only then remove what a resumed run would have needed.
+
+    :param trained: seconds that training took
+    """
+    result = _final(model, spec, folder, trained)
     folder.finish(result)
+    if not options.keep_checkpoint:
+        remove_checkpoints(folder.path)
     return result
-
-
-def _train(model: Agent, n_timesteps: int, callback: BaseCallback, progress: bool) -> None:
-    fresh = model.num_timesteps == 0
-    model.learn(n_timesteps - model.num_timesteps, callback=callback, reset_num_timesteps=fresh, progress_bar=progress)
 
 
 def _final(model: Agent, spec: RunSpec, folder: RunFolder, trained: float) -> dict[str, Any]:
@@ -266,25 +401,3 @@ def _final(model: Agent, spec: RunSpec, folder: RunFolder, trained: float) -> di
         "wall_time": round(trained, 1),
         "steps_per_second": round(model.num_timesteps / max(trained, 1e-9), 1),
     }
-
-
-def _save_checkpoint(model: Agent, folder: RunFolder, wall_time: float) -> None:
-    """Agent, replay buffers and clock, written aside and then swapped in: they always belong together."""
-    new, old = folder.path / f"checkpoint.new{os.getpid()}", folder.path / "checkpoint.old"
-    shutil.rmtree(new, ignore_errors=True)
-    new.mkdir(parents=True)
-    model.save(new / "model.zip")
-    model.save_replay_buffer(new / "replay_buffer.pkl")
-    write_atomic(new / "state.json", to_json({"timesteps": int(model.num_timesteps), "wall_time": wall_time}))
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.checkpoint.exists():
-        folder.checkpoint.rename(old)
-    new.rename(folder.checkpoint)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def _mend_checkpoint(folder: RunFolder) -> None:
-    """Take the previous checkpoint if the process died between the two renames of the swap."""
-    old = folder.path / "checkpoint.old"
-    if not folder.checkpoint.exists() and old.exists():
-        old.rename(folder.checkpoint)

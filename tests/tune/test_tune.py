@@ -237,7 +237,7 @@ def test_a_run_that_is_not_finite_is_pruned_with_its_reason(tmp_path: Path) -> N
 
 
 def test_a_diverging_run_is_pruned_with_its_reason() -> None:
-    watch = trials.LossWatch()
+    watch = trials.LossWatch(trials.DIVERGED)
     watch.write({"low/critic_loss": 3.0, "low/q_mean": 1e9}, {}, 100)
     assert watch.reason == ""
     watch.write({"low/critic_loss": 2e6, "high/critic_loss": float("nan")}, {}, 1200)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, WriteError
 from sb3_tbc.files import write_atomic
 from sb3_tbc.zoo import ledger
 from sb3_tbc.zoo.callbacks import EvaluationRow, read_evaluations, write_evaluations
@@ -115,10 +116,10 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
     write_atomic(path, "old")
 
     def fail(*_: Any, **__: Any) -> None:
-        raise OSError("disk full")
+        raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", fail)
-    with pytest.raises(OSError, match="disk full"):
+    monkeypatch.setattr(Path, "write_bytes", fail)
+    with pytest.raises(WriteError, match=r"cannot write .*final.json: No space left on device; make room"):
         write_atomic(path, "new")
     assert path.read_text() == "old"
 

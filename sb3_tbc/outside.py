@@ -1,0 +1,109 @@
+"""Names, numbers and URLs that come from outside: one function for each, which all that write or show them use."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any
+
+from sb3_tbc.errors import ConfigError
+
+MAX_NAME = 150
+"""Longest name of a folder, in bytes; file systems allow 255, and files in it get suffixes."""
+SECRET = re.compile(r"(pass\w*|pwd|secret|token|key)\s*(=|%3d|:)", re.IGNORECASE)
+HIDDEN = "***"
+
+
+def folder_name(text: str, what: str) -> str:
+    """A text as the name of one folder, unchanged; slashes and dots must not lead out of the folder it lies in.
+
+    :param text: the name
+    :param what: what it names, for messages
+    :raises ConfigError: if it is no name of a folder everywhere, with what is allowed
+    """
+    if not isinstance(text, str):
+        raise ConfigError(f"{what} must be a text, got {text!r}; put quotes around it in YAML")
+    bad = [c for c in text if c in '/\\:*?"<>|' or not c.isprintable() or "\ud800" <= c <= "\udfff"]
+    if bad or not text or text.startswith((".", "-", " ")) or text.endswith((".", " ")):
+        raise ConfigError(
+            f"{what} must be a name for a folder: letters, digits, and - _ . = + inside; got {text!r}"
+            + (f" with {bad[0]!r}" if bad else "")
+        )
+    if len(text.encode()) > MAX_NAME:
+        raise ConfigError(f"{what} must be at most {MAX_NAME} bytes long, got {len(text.encode())}")
+    return text
+
+
+def flat_name(text: str, what: str) -> str:
+    """An environment id or task as the name of a folder: its slashes and colons become underscores.
+
+    :raises ConfigError: if it is no name even then
+    """
+    return folder_name(text.replace("/", "_").replace(":", "_") if isinstance(text, str) else text, what)
+
+
+def number(value: Any, what: str, low: float = -math.inf, high: float = math.inf) -> float:
+    """A finite number within bounds; texts and truth values are none, whatever they look like.
+
+    :param value: as JSON or YAML gave it
+    :param what: what it is, for messages
+    :raises ConfigError: otherwise
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ConfigError(f"{what} must be a finite number, got {value!r}")
+    if not low <= value <= high:
+        raise ConfigError(f"{what} must lie in [{low:g}, {high:g}], got {value!r}")
+    return float(value)
+
+
+def one_line(text: object, longest: int = 300) -> str:
+    """A foreign message in one line of printable characters, cut where it is too long."""
+    line = " ".join("".join(c if c.isprintable() or c.isspace() else f"\\x{ord(c):02x}" for c in str(text)).split())
+    return line if len(line) <= longest else f"{line[: longest - 3]}..."
+
+
+def without_password(url: str) -> str:
+    """A storage's name without its password, wherever one stands, in a mistyped URL too.
+
+    Rather more is hidden than too little: all between the account's first colon and the last ``@``, every query and
+    fragment that speaks of a secret, and the whole of a connection string made of such parts.
+    """
+    head, mark, tail = re.match(r"([^?#]*)([?#]?)(.*)", url, re.DOTALL).groups()  # type: ignore[union-attr]
+    scheme, head = _split_scheme(head)
+    account, at, host = head.rpartition("@")
+    if at:
+        user, colon, _ = _split_account(account)
+        head = f"{user}{colon}{HIDDEN if colon else ''}{at}{host}"
+    elif scheme and not _looks_like_host(head):
+        head = f"{head.partition(':')[0]}:{HIDDEN}"
+    elif SECRET.search(head):
+        head = _up_to_secret(head)
+    if "@" in tail and not at:  # the account stands behind the mark: a password with ? or # in it
+        return f"{scheme}{head.partition(':')[0]}:{HIDDEN}@{tail.rpartition('@')[2]}"
+    return f"{scheme}{head}{mark}{_up_to_secret(tail) if SECRET.search(tail) else tail}"
+
+
+def _split_scheme(head: str) -> tuple[str, str]:
+    """``postgresql+psycopg://`` and the rest; a mistyped scheme counts when an account may follow."""
+    found = re.match(r"([A-Za-z][\w+.-]*:/*)(?=.*@)|([A-Za-z][\w+.-]+:/+)", head)
+    if found is None or (found.group(1) and not found.group(1).endswith("/") and head.count(":") == 1):
+        return "", head
+    return found.group(), head[found.end() :]
+
+
+def _split_account(account: str) -> tuple[str, str, str]:
+    """User, colon and password; a colon may be written as ``%3A``."""
+    found = re.search(r":|%3a", account, re.IGNORECASE)
+    return (account, "", "") if found is None else (account[: found.start()], ":", account[found.end() :])
+
+
+def _looks_like_host(head: str) -> bool:
+    """Whether what follows the slashes is ``host:port/name`` or a path, rather than ``user:password``."""
+    return (
+        re.fullmatch(r"[^:]*|[^:/]*:\d{1,5}(/.*)?|/?[A-Za-z]:[\\/].*|\[[0-9a-fA-F:]+\](:\d+)?(/.*)?", head) is not None
+    )
+
+
+def _up_to_secret(text: str) -> str:
+    found = SECRET.search(text)
+    return text if found is None else f"{text[: found.end()]}{HIDDEN}"

@@ -1,0 +1,55 @@
+"""Stopping when asked: a signal sets a flag, and the work stops at its next point from which it can go on exactly."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from types import FrameType
+
+SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
+"""Ctrl-C, a polite kill or a shutdown, and a lost connection."""
+
+
+class StopRequest:
+    """Whether this process was asked to stop; true once and for all."""
+
+    def __init__(self) -> None:
+        self.signal: str | None = None
+
+    def __bool__(self) -> bool:
+        return self.signal is not None
+
+    def ask(self, number: int, frame: FrameType | None = None) -> None:
+        """Take note of a signal; a further one changes nothing, so that an impatient second Ctrl-C loses nothing."""
+        again, self.signal = self.signal is not None, signal.Signals(number).name
+        with contextlib.suppress(OSError, ValueError, RuntimeError):  # the terminal may be gone, or writing already
+            print(
+                f"\n{self.signal}: stopping already; `kill -9` ends it without saving"
+                if again
+                else f"\n{self.signal}: stopping as soon as all is at a point to go on from",
+                file=sys.stderr,
+                flush=True,
+            )
+
+
+@contextlib.contextmanager
+def stop_request() -> Iterator[StopRequest]:
+    """Let signals set a flag within the block; before and after it they do what they did.
+
+    In a thread other than the main one signals cannot be caught: the flag stays unset.
+    """
+    request = StopRequest()
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for name in SIGNALS:
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
+            if number is not None and signal.getsignal(number) != signal.SIG_IGN:  # nohup, a script's background
+                before[number] = signal.signal(number, request.ask)
+    try:
+        yield request
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

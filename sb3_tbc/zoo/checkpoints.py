@@ -1,0 +1,179 @@
+"""Checkpoints of a run: the last two, whole or not at all, with checksums that tell a damaged file.
+
+Whatever the moment at which the process dies, the folder holds the newest or the one before: a new one is written aside
+and put on the disk, then takes its name; only then, with the next, the oldest goes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.files import digest, explained, remove, sync, write_atomic
+
+NEWEST, BEFORE, BROKEN = "checkpoint", "checkpoint.old", "checkpoint.broken"
+UNFINISHED = "checkpoint.new*"
+MODEL, REPLAY, STATE = "model.zip", "replay_buffer.pkl", "state.json"
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """A checkpoint whose files are whole.
+
+    :param path: its folder
+    :param timesteps: environment steps done
+    :param wall_time: seconds they took, evaluations included
+    """
+
+    path: Path
+    timesteps: int
+    wall_time: float
+
+    @property
+    def model(self) -> Path:
+        """The agent."""
+        return self.path / MODEL
+
+    @property
+    def replay_buffer(self) -> Path:
+        """Replay buffers, random streams, running episodes."""
+        return self.path / REPLAY
+
+
+def save_checkpoint(
+    run: Path,
+    timesteps: int,
+    wall_time: float,
+    save_model: Callable[[Path], object],
+    save_replay: Callable[[Path], object],
+) -> None:
+    """Write a checkpoint into a run's folder; the one before stays, the one before that goes.
+
+    :param save_model: writes the agent to a path
+    :param save_replay: writes the replay buffers to a path
+    :raises WriteError: if it cannot be written; the earlier ones are untouched then
+    """
+    newest, before, new = run / NEWEST, run / BEFORE, run / "checkpoint.new"
+    remove_unfinished(run)
+    try:
+        with explained(newest):
+            new.mkdir(parents=True)
+            save_model(new / MODEL)
+            save_replay(new / REPLAY)
+            for name in (MODEL, REPLAY):
+                sync(new / name)
+            write_atomic(new / STATE, _state(new, timesteps, wall_time))
+            sync(run)
+    except BaseException:
+        remove(new)
+        raise
+    with explained(newest):
+        if newest.exists():
+            remove(before)
+            newest.rename(before)
+        new.rename(newest)
+        sync(run)
+    remove(run / BROKEN)
+
+
+def _state(folder: Path, timesteps: int, wall_time: float) -> str:
+    state = {
+        "timesteps": timesteps,
+        "wall_time": wall_time,
+        "sha256": {name: digest(folder / name) for name in (MODEL, REPLAY)},
+    }
+    return json.dumps({**state, "state_sha256": _sum_of(state)}, indent=2) + "\n"
+
+
+def _sum_of(state: dict[str, Any]) -> str:
+    return hashlib.sha256(json.dumps(state, sort_keys=True).encode()).hexdigest()
+
+
+def find_checkpoint(run: Path) -> Checkpoint | None:
+    """The newest checkpoint of a run that is whole; damaged ones are named in the log. None if there is none.
+
+    :raises ConfigError: if there are checkpoints, but all are damaged, naming each file
+    """
+    damage: list[str] = []
+    for folder in _candidates(run):
+        try:
+            found = read_checkpoint(folder)
+        except ConfigError as error:
+            damage.append(str(error))
+            continue
+        if damage:
+            logger.warning(f"{'; '.join(damage)}; going on from the checkpoint before, at {found.timesteps} steps")
+        return found
+    if damage:
+        raise ConfigError(f"no whole checkpoint: {'; '.join(damage)}; start the run again with --overwrite")
+    return None
+
+
+def has_checkpoint(run: Path) -> bool:
+    """Whether there is something to resume from, whole or not."""
+    return any(True for _ in _candidates(run))
+
+
+def _candidates(run: Path) -> Iterator[Path]:
+    return (run / name for name in (NEWEST, BEFORE) if (run / name).is_dir())
+
+
+def read_checkpoint(folder: Path) -> Checkpoint:
+    """Read a checkpoint's state and compare its files with their checksums; those of earlier versions have none.
+
+    :raises ConfigError: naming the damaged or missing file
+    """
+    path = folder / STATE
+    try:
+        state = json.loads(path.read_text(encoding="utf-8"))
+        given = state.pop("state_sha256", None)
+        if given is not None and given != _sum_of(state):
+            raise ValueError("it fails its checksum")
+        found = Checkpoint(folder, int(state["timesteps"]), float(state["wall_time"]))
+        sums = dict(state.get("sha256", {}))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
+        raise ConfigError(f"{path} is damaged ({error})") from error
+    for name in (MODEL, REPLAY):
+        if not (folder / name).is_file():
+            raise ConfigError(f"{folder / name} is missing")
+        if name in sums and sums[name] != digest(folder / name):
+            raise ConfigError(f"{folder / name} is damaged: it fails its checksum")
+    return found
+
+
+def keep_only(run: Path, checkpoint: Checkpoint) -> Checkpoint:
+    """Make a checkpoint the newest, so that the next one does not push it out; a damaged one is put aside.
+
+    :return: the same checkpoint under its new name
+    """
+    if checkpoint.path.name == NEWEST:
+        return checkpoint
+    newest = run / NEWEST
+    with explained(newest):
+        if newest.exists():
+            remove(run / BROKEN)
+            newest.rename(run / BROKEN)
+        checkpoint.path.rename(newest)
+        sync(run)
+    return Checkpoint(newest, checkpoint.timesteps, checkpoint.wall_time)
+
+
+def remove_unfinished(run: Path) -> None:
+    """Remove what killed processes left of checkpoints that they were writing."""
+    for folder in run.glob(UNFINISHED):
+        remove(folder)
+
+
+def remove_checkpoints(run: Path) -> None:
+    """Remove all of a run's checkpoints, the oldest first."""
+    remove_unfinished(run)
+    for name in (BROKEN, BEFORE, NEWEST):
+        remove(run / name)

@@ -1,0 +1,113 @@
+"""What keeps a run's last good state: noticing divergence, and remembering the last point to go on from."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter
+
+from sb3_tbc.errors import DivergedError
+from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.resume import get_state
+
+DIVERGED = 1e12
+"""Critic loss beyond all sense: values of a million, where returns are of the order of 10 to 1000."""
+CURE = "a lower learning rate or rewards of smaller scale usually cure it"
+
+
+class LossWatch(KVWriter):
+    """Reads what an agent logs and remembers the first sign of divergence.
+
+    :param limit: critic loss at which a run counts as diverging
+    """
+
+    def __init__(self, limit: float = DIVERGED) -> None:
+        self.limit = limit
+        self.reason = ""
+
+    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+        """Look at the critics' losses of one dump."""
+        for key, value in key_values.items():
+            if key.endswith("critic_loss") and not self.reason and not abs(float(value)) < self.limit:
+                self.reason = f"diverging: {key} is {value:.3g} at step {step:,}"
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+def check_weights(model: BaseAlgorithm) -> None:
+    """Refuse to keep an agent whose weights are no numbers any more.
+
+    :raises DivergedError: naming the first such tensor
+    """
+    for name, tensor in model.policy.state_dict().items():
+        if tensor.is_floating_point() and not th.isfinite(tensor).all():
+            raise DivergedError(f"the agent's {name} is no longer finite")
+
+
+class DivergenceCallback(BaseCallback):
+    """Ends training when the critics' losses leave all sense.
+
+    :param limit: the loss that does
+    """
+
+    def __init__(self, limit: float = DIVERGED) -> None:
+        super().__init__()
+        self.watch = LossWatch(limit)
+
+    def _init_callback(self) -> None:
+        self.logger.output_formats.append(self.watch)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        self.watch.write(self.logger.name_to_value, {}, self.num_timesteps)
+        if self.watch.reason:
+            raise DivergedError(f"{self.watch.reason}; {CURE}")
+
+
+class ConsistentState(BaseCallback):
+    """Remembers the last point to go on from, so that a fault of an environment in mid-rollout loses that rollout only.
+
+    While steps are collected neither weights nor replay change, so that all that must be remembered is small. From the
+    end of a rollout to the beginning of the next they do, and nothing is remembered.
+    """
+
+    ATTRIBUTES = (
+        *("num_timesteps", "_episode_num", "_current_progress_remaining", "_n_updates", "_updated_at"),
+        *("ep_info_buffer", "ep_success_buffer"),
+    )
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._attributes: dict[str, Any] = {}
+        self._arrays: dict[str, NDArray[Any]] = {}
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if isinstance(self.model, TBCHRL):
+            self._arrays = {name: np.array(array) for name, array in get_state(self.model).items()}
+            self._attributes = {n: deepcopy(getattr(self.model, n)) for n in self.ATTRIBUTES if hasattr(self.model, n)}
+
+    def _on_rollout_end(self) -> None:
+        self._arrays, self._attributes = {}, {}
+
+    def go_back(self) -> Callable[[Path], None] | None:
+        """Take the agent back to that point, and return what writes its replay; None if there is no such point."""
+        model = self.model
+        if not self._attributes or not isinstance(model, TBCHRL):
+            return None
+        vars(model).update(self._attributes)
+        arrays = self._arrays
+        return lambda path: model.replay_buffer.save(path, arrays)
