@@ -11,7 +11,7 @@ SEED ?= 0
 STEPS ?= $(if $(filter Pendulum,$(ENV)),100000,)
 RUN := runs/$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: help install train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks bench pretrained clean
+.PHONY: help install train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks bench report pretrained clean
 
 help:
 	@echo "install          .venv with the package (editable) and what its tests need"
@@ -20,6 +20,7 @@ help:
 	@echo "pytest           the fast tests alone        pytest-slow  all tests"
 	@echo "type lint        mypy, ruff                  format       ruff format and fixes"
 	@echo "check-codestyle  format and lint, no change  commit-checks format type lint"
+	@echo "report           the results page of the docs and the HTML report, from the ledger in results/"
 	@echo "doc notebooks    build the pages, run the notebooks        bench  steps per second"
 	@echo "pretrained       train the agents that come with the package [TASKS=]"
 
@@ -34,8 +35,8 @@ install: $(VENV)/.installed
 
 train: install
 	$(BIN)/python -m sb3_tbc.train --algo $(ALGO) --env $(ENV) --seed $(SEED) $(if $(STEPS),--n-timesteps $(STEPS)) \
-	    --log-folder $(RUN) --progress
-	-$(BIN)/python -m sb3_tbc.evaluate $(RUN)/*/*/*/*/model.zip --n-episodes 3 --video $(RUN)/episodes.mp4 >/dev/null
+	    --log-folder $(RUN) --progress --trace
+	-$(BIN)/python -m sb3_tbc.evaluate $(RUN)/*/*/*/*/model.zip --n-episodes 3 --video $(RUN)/episodes.mp4
 	$(BIN)/python -m sb3_tbc.report $(RUN) --html $(RUN)/report.html
 
 test: install pytest
@@ -65,6 +66,11 @@ commit-checks: format type lint
 doc: install
 	$(BIN)/python -m pip install --quiet --editable '.[docs]' --constraint constraints.txt
 	$(BIN)/sphinx-build -W -b html docs docs/_build/html
+
+# The same ledger gives the same bytes.
+report: install
+	$(BIN)/python -m sb3_tbc.report results --update docs/results.md --html docs/_static/report.html \
+	    --measured sb3_tbc/zoo/measured.yml
 
 notebooks: install
 	$(BIN)/python -m pytest -m "slow or not slow" tests/test_notebooks.py

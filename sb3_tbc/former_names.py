@@ -30,7 +30,7 @@ FORMER_NAMES = {
     "sb3_tbc.layout": "sb3_tbc.smdp.views",
     "sb3_tbc.low_reward": "sb3_tbc.smdp.rewards",
     "sb3_tbc.options": "sb3_tbc.smdp.options",
-    "sb3_tbc.plotting": "sb3_tbc.report.plotting",
+    "sb3_tbc.plotting": "sb3_tbc.report.curves",
     "sb3_tbc.ring_buffer": "sb3_tbc.replay.ring",
     "sb3_tbc.spaces": "sb3_tbc.smdp.spaces",
     "sb3_tbc.tasks.benchmark": "sb3_tbc.benchmark.tasks",

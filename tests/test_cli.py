@@ -14,7 +14,6 @@ import pytest
 import yaml
 
 from sb3_tbc import __main__, evaluate, train
-from sb3_tbc.report import command as report
 from sb3_tbc.zoo.ledger import RunFolder
 
 TINY = ["--hyperparams", "compile:false", "gradient_ratio:0.05", "low.batch_size:16", "high.batch_size:4"]
@@ -212,59 +211,6 @@ def test_ctrl_c_saves_and_resume_finishes(
     assert train.main(["--resume", str(folder.path), "--no-progress", "--ledger", str(ledger)]) == 0
     assert folder.read_final()["n_timesteps"] == 300
     assert RunFolder.of(ledger, "Pendulum", "hits", "full-paper", 0).finished
-
-
-def test_report(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    page = tmp_path / "report.html"
-    assert report.main([str(root), "--html", str(page)]) == 0
-    assert "| Pendulum | tbc-hrl | 1" in capsys.readouterr().out
-    assert page.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
-    assert "data:image/png;base64," in page.read_text()
-    assert report.main([str(tmp_path)]) == 2
-    assert "no finished runs" in said(capsys)
-
-
-def fake_run(root: Path, task: str, algo: str, seed: int, rate: float) -> None:
-    folder = RunFolder.of(root, task, algo, "full", seed)
-    folder.start({}, "x")
-    identity = {"task": task, "algo": algo, "variant": "full", "seed": seed, "success_rate": rate}
-    rest = {"mean_length_success": 10.0, "subgoal_success": 0.5, "mean_window": 4.0, "stable_share": 1.0}
-    lines = ["timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,wall_time"]
-    lines += [f"{1000 * i},{rate * i / 4},10,10,0.5,4,{i}" for i in range(1, 5)]
-    folder.evaluations.write_text("\n".join(lines) + "\n")
-    folder.finish({**identity, **rest})
-
-
-def test_report_compares_with_the_strongest_baseline(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for seed, noise in enumerate((0.0, 0.01, 0.02)):
-        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.95 + noise)
-        fake_run(tmp_path, "A", "hits", seed, 0.80 + noise)
-        fake_run(tmp_path, "A", "hac", seed, 0.30 + noise)
-    assert report.main([str(tmp_path)]) == 0
-    text = capsys.readouterr().out
-    (line,) = [line for line in text.splitlines() if line.startswith("| A ") and "+0.150" in line]
-    cells = [cell.strip() for cell in line.split("|")]
-    assert cells[3] == "+0.150"
-    assert cells[6:8] == ["**", "+1.00"]
-    assert int(cells[8].replace(",", "")) > 0
-
-
-def test_report_fills_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fake_run(tmp_path / "results", "A", "tbc-hrl", 0, 0.5)
-    page = tmp_path / "README.md"
-    page.write_text("top\n<!-- results:begin -->\nold\n<!-- results:end -->\nbottom\n")
-    for _ in range(2):
-        assert report.main([str(tmp_path / "results"), "--update", str(page)]) == 0
-    text = page.read_text()
-    assert text.startswith("top\n<!-- results:begin -->\n| task")
-    assert text.endswith("<!-- results:end -->\nbottom\n")
-    assert text.count("| A ") == 1
-    assert "old" not in text
-    capsys.readouterr()
-    page.write_text("no marks")
-    assert report.main([str(tmp_path / "results"), "--update", str(page)]) == 2
-    assert "needs the lines" in said(capsys)
-    assert page.read_text() == "no marks"
 
 
 @pytest.mark.parametrize(

@@ -76,22 +76,122 @@ def test_cliffs_delta_counts_pairs(first: list[int], second: list[int]) -> None:
 def test_welch_matches_scipy_and_survives_constant_samples() -> None:
     a, b = [0.9, 0.95, 1.0], [0.7, 0.8, 0.75, 0.72]
     assert stats.welch_test(a, b) == pytest.approx(scipy_stats.ttest_ind(a, b, equal_var=False).pvalue)
-    assert stats.welch_test([1.0, 1.0], [1.0, 1.0]) == 1.0
-    assert stats.welch_test([1.0, 1.0], [0.9, 0.9]) == 0.0
+    assert stats.welch_test([1.0, 1.0], [1.0, 1.0]) is None
+    assert stats.welch_test([1.0, 1.0], [0.9, 0.9]) is None  # no variance, no test: not "certainly different"
+    assert stats.welch_test([1.0, 1.0], [0.9, 0.8]) is not None
     with pytest.raises(ValueError, match="two seeds a side"):
         stats.welch_test([1.0], [0.5, 0.6])
 
 
 def test_compare_marks_and_corrects() -> None:
-    ours = {"A": [0.99, 0.98, 0.97, 0.98], "B": [0.5, 0.7, 0.6, 0.4], "C": [0.5]}
-    theirs = {"A": [0.5, 0.52, 0.48, 0.5], "B": [0.5, 0.6, 0.55, 0.5], "C": [0.4, 0.5]}
+    ours = {"A": [0.99, 0.98, 0.97, 0.98], "B": [0.5, 0.7, 0.6, 0.4], "C": [0.5], "D": [1.0] * 3, "E": [0.1, 0.2]}
+    theirs = {"A": [0.5, 0.52, 0.48, 0.5], "B": [0.5, 0.6, 0.55, 0.5], "C": [0.4, 0.5], "D": [1.0] * 5, "E": [0.3] * 5}
     result = stats.compare(ours, theirs)
-    assert set(result) == {"A", "B"}
+    assert set(result) == set(ours)
     assert result["A"].mark == "**"
     assert result["A"].cliffs_delta == 1.0
+    assert result["A"].improvement == 1.0
     assert result["B"].mark == ""
-    assert result["A"].p_holm == pytest.approx(2 * result["A"].p_value)
+    assert result["A"].p_value is not None
+    assert result["A"].p_holm == pytest.approx(2 * result["A"].p_value)  # two tests; C, D and E do not count
     assert result["A"].difference == pytest.approx(0.48)
+    assert [(result[k].p_value, result[k].p_holm, result[k].mark) for k in "CDE"] == [(None, None, "")] * 3
+    assert [result[k].note for k in "ABCDE"] == ["", "", *[stats.TOO_FEW_SEEDS], stats.NO_VARIANCE, stats.TOO_FEW_SEEDS]
+
+
+def test_clopper_pearson_against_the_beta_distribution() -> None:
+    low, high = stats.clopper_pearson(87, 100)
+    assert low == pytest.approx(scipy_stats.beta.ppf(0.025, 87, 14))
+    assert high == pytest.approx(scipy_stats.beta.ppf(0.975, 88, 13))
+    assert stats.clopper_pearson(10, 10)[0] == pytest.approx(0.025 ** (1 / 10))
+    with pytest.raises(ValueError, match="11 of 10"):
+        stats.clopper_pearson(11, 10)
+
+
+def test_success_intervals_never_have_width_zero() -> None:
+    all_succeed = stats.success_interval([1.0] * 5, [100] * 5)
+    assert all_succeed == (1.0, pytest.approx(0.025 ** (1 / 500)), 1.0)
+    assert stats.success_interval([0.9], [100])[1:] == pytest.approx(stats.clopper_pearson(90, 100))
+    with pytest.raises(ValueError, match="one number of episodes"):
+        stats.success_interval([0.9, 0.8], [100])
+
+
+def test_the_seed_is_the_unit_not_the_episode() -> None:
+    """Half of the seeds never learn: 400 episodes say .5 within .05, four seeds say next to nothing."""
+    rates, episodes = [0.0, 0.0, 1.0, 1.0], [100] * 4
+    interval = stats.success_interval(rates, episodes)
+    assert interval[1:] == stats.bootstrap_mean(rates)[1:] == (0.0, 1.0)
+    assert np.diff(stats.clopper_pearson(200, 400)) < 0.11
+
+
+def test_success_intervals_cover_the_truth() -> None:
+    """Seeds with a true rate of their own around .8: the mean of all seeds is covered nearly as often as promised."""
+    rng = np.random.default_rng(3)
+    hits = 0
+    for _ in range(200):
+        rates = rng.binomial(100, rng.beta(16, 4, size=10)) / 100
+        interval = stats.success_interval(rates, [100] * 10, n_resamples=500)
+        hits += interval.low <= 0.8 <= interval.high
+    assert 0.85 <= hits / 200 <= 0.99
+
+
+def test_paired_block_bootstrap_against_scipy() -> None:
+    rng = np.random.default_rng(0)
+    first, second = rng.random(60), rng.random(60)
+    ours = stats.paired_block_bootstrap([first], [second])
+    theirs = scipy_stats.bootstrap(
+        (first, second), lambda a, b: np.mean(a - b), paired=True, vectorized=False, method="percentile", rng=1
+    )
+    assert ours.mean == pytest.approx(np.mean(first - second))
+    assert (ours.low, ours.high) == pytest.approx(theirs.confidence_interval, abs=0.01)
+    assert stats.paired_block_bootstrap([first], [second]) == ours
+    with pytest.raises(ValueError, match="as many episodes"):
+        stats.paired_block_bootstrap([first], [second[:10]])
+    with pytest.raises(ValueError, match="the same seeds"):
+        stats.paired_block_bootstrap([first, first], [second])
+
+
+def test_pairing_and_blocks_matter() -> None:
+    rng = np.random.default_rng(1)
+    base = rng.random(100)
+    paired = stats.paired_block_bootstrap([base + 0.1], [base])
+    assert (paired.low, paired.high) == pytest.approx((0.1, 0.1))  # the same episodes on both sides: no noise is left
+    slow = np.repeat(rng.random(10), 10)  # episodes that resemble their neighbours
+    single = stats.paired_block_bootstrap([slow], [np.zeros(100)])
+    blocks = stats.paired_block_bootstrap([slow], [np.zeros(100)], block=10)
+    assert blocks.high - blocks.low > 2 * (single.high - single.low)
+
+
+def test_differences_combine_both_intervals() -> None:
+    first, second = stats.Interval(0.9, 0.8, 0.95), stats.Interval(0.6, 0.5, 0.7)
+    interval = stats.difference(first, second)
+    assert interval == pytest.approx((0.3, 0.3 - np.hypot(0.1, 0.1), 0.3 + np.hypot(0.05, 0.1)))
+    equal = stats.success_interval([1.0, 1.0], [100, 100])
+    assert stats.difference(equal, equal).low < 0 < stats.difference(equal, equal).high
+    rng, hits = np.random.default_rng(0), 0
+    for _ in range(300):
+        sides = [stats.success_interval([rng.binomial(100, p) / 100], [100]) for p in (0.9, 0.7)]
+        interval = stats.difference(*sides)
+        hits += interval.low <= 0.2 <= interval.high
+    assert hits / 300 >= 0.93
+
+
+def test_interquartile_mean_and_spread() -> None:
+    tasks = [[0.0, 0.5, 1.0, 0.7], [0.2, 0.4, 0.6, 0.8]]
+    iqm = stats.interquartile_mean(tasks)
+    assert iqm.mean == pytest.approx(scipy_stats.trim_mean(np.concatenate(tasks), 0.25))
+    assert iqm.low < iqm.mean < iqm.high
+    assert stats.interquartile_mean([[0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]]).mean == 1.0
+    assert stats.spread(np.arange(11.0)) == (0.0, 1.0, 9.0, 10.0)
+    with pytest.raises(ValueError, match="at least one seed"):
+        stats.interquartile_mean([[]])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.integers(0, 3), min_size=1, max_size=6), st.lists(st.integers(0, 3), min_size=1, max_size=6))
+def test_probability_of_improvement_counts_pairs(first: list[int], second: list[int]) -> None:
+    wins = [1.0 if a > b else 0.5 if a == b else 0.0 for a in first for b in second]
+    assert stats.probability_of_improvement(first, second) == pytest.approx(np.mean(wins))
 
 
 def test_stability_and_steps_to() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import yaml
 
-from sb3_tbc.report.tables import OURS, Results
+from sb3_tbc.report.runs import OURS, Results
 
 HEADER = "# Written by: python -m sb3_tbc.report --measured. Runs of tbc-hrl with the shipped settings in the ledger.\n"
 

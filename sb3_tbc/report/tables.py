@@ -1,161 +1,200 @@
-"""Tables 2 and 3 from a folder of results."""
+"""Tables of the results as lists of cells: all rows, comparisons, the paper's figures beside ours, conditions."""
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_tbc import stats
-from sb3_tbc.errors import ConfigError
-from sb3_tbc.report.plotting import Curve, common_grid
-from sb3_tbc.zoo.callbacks import EvaluationRow
-from sb3_tbc.zoo.ledger import finished_runs
+from sb3_tbc.report.comparisons import Row, against_ablations, against_baselines, interval_of
+from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
+from sb3_tbc.report.paper import Paper
+from sb3_tbc.report.runs import Results, Run, describe, shipped, successes
 
-OURS = "tbc-hrl"
+Table = list[list[str]]
+Descriptions = Mapping[str, Mapping[str, str]]
 
-
-class Run(NamedTuple):
-    """A finished run: its ``final.json`` and its learning curve."""
-
-    final: dict[str, Any]
-    rows: list[EvaluationRow]
-
-    @property
-    def method(self) -> str:
-        """The algorithm, with the variant where it is not the full one."""
-        algo, variant = str(self.final["algo"]), str(self.final["variant"])
-        return algo if variant == "full" else f"{algo} {variant}"
-
-    @property
-    def curve(self) -> Curve:
-        """Success rate against steps."""
-        return Curve([row.timesteps for row in self.rows], [row.success_rate for row in self.rows])
-
-
-Results = dict[str, dict[str, list[Run]]]
-"""Task -> method -> runs, one per seed."""
-
-
-def load_results(root: Path) -> Results:
-    """All finished runs below a folder.
-
-    :raises ConfigError: if there is none or one cannot be read
-    """
-    results: Results = defaultdict(lambda: defaultdict(list))
-    for folder in finished_runs(root):
-        try:
-            run = Run(folder.read_final(), folder.read_evaluations())
-            results[str(run.final["task"])][run.method].append(run)
-        except (KeyError, ValueError, TypeError) as error:
-            raise ConfigError(f"cannot read the run in {folder.path}: {error!r}") from error
-    if not results:
-        raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
-    return {task: {m: methods[m] for m in sorted(methods, key=_rank)} for task, methods in sorted(results.items())}
+HEADER = (
+    *("task", "method", "seeds", "success", "sd", "95 % interval", "length", "subgoals", "window", "to 0.9", "stable"),
+    "worst",
+)
+NOTES = (
+    "Success: share of the final evaluation's episodes, mean over seeds. Interval: with three seeds or more a "
+    "bootstrap over seeds (10,000 resamples), widened where needed to the exact interval over episodes "
+    "(Clopper-Pearson); with one or two seeds the exact interval alone, which holds for these agents and not for "
+    "other seeds. Length: mean steps of successful episodes. Subgoals: share of windows that reached theirs. Window: "
+    "mean executed length in steps. To 0.9: steps until an evaluation first succeeds in 0.9 of its episodes. Stable: "
+    "share of evaluations at 0.9 or more from then on, mean over seeds. Worst: the lowest of these evaluations, of "
+    "all seeds."
+)
+COMPARISON_NOTES = (
+    "Difference: ours minus theirs, with its 95 % interval. p: Welch's test on seeds, two-sided; (Holm): corrected "
+    "over all tests of the table; * below 0.05, ** below 0.01. There is no test with fewer than three seeds on a "
+    "side, nor where no seed differs from another. Better: probability that a run of ours beats one of theirs, ties "
+    "counted half. Steps saved: to the common threshold, 0.9 of the best mean success of any method on the task, "
+    "where that is 0.5 or more; evaluations are far apart, so small differences mean little."
+)
 
 
-def _rank(method: str) -> tuple[bool, str]:
-    return not method.startswith(OURS), method
-
-
-def successes(runs: Sequence[Run]) -> list[float]:
-    """Final success rate of each seed."""
-    return [float(run.final["success_rate"]) for run in runs]
-
-
-def strongest_baseline(methods: Mapping[str, Sequence[Run]]) -> str | None:
-    """The method with the best mean that is neither ours nor an ablation of ours."""
-    others = [m for m in methods if not m.startswith(OURS)]
-    return max(others, key=lambda m: float(np.mean(successes(methods[m]))), default=None)
-
-
-def convergence_gain(ours: Sequence[Run], baseline: Sequence[Run]) -> int | None:
-    """Environment steps saved to a common success threshold, 0.9 of the smaller of both best mean success rates.
-
-    :return: positive when ours is there earlier; ``None`` without curves
-    """
-    curves = [[run.curve for run in runs if run.rows] for runs in (ours, baseline)]
-    if not all(curves):
-        return None
-    means = [(grid, values.mean(axis=0)) for grid, values in (common_grid(c, 400) for c in curves)]
-    threshold = 0.9 * min(mean.max() for _, mean in means)
-    first, second = (stats.steps_to(grid.astype(int).tolist(), mean.tolist(), threshold) for grid, mean in means)
-    return None if first is None or second is None else second - first
-
-
-def success_table(results: Results) -> list[list[str]]:
-    """Table 2 and 3: per task and method the mean over seeds, its interval, and how the agents behave."""
-    header = [
-        "task",
-        "method",
-        "seeds",
-        "success",
-        "sd",
-        "95 % interval",
-        "length",
-        "subgoals",
-        "window",
-        "to 0.9",
-        "stable",
-        "worst",
-    ]
-    table = [header]
+def success_table(results: Results) -> Table:
+    """All rows: per task and method the mean over seeds, its interval, and how the agents behave."""
+    table = [list(HEADER)]
     for task, methods in results.items():
         table += [_success_row(task, method, runs) for method, runs in methods.items()]
     return table
 
 
 def _success_row(task: str, method: str, runs: Sequence[Run]) -> list[str]:
-    values = successes(runs)
-    interval = stats.bootstrap_mean(values)
-    first = [stats.steps_to(*run.curve, 0.9) for run in runs]
-    reached = [steps for steps in first if steps is not None]
-    to_90 = f"{np.mean(reached) / 1000:.0f} k" if len(reached) == len(runs) else f"{len(reached)} of {len(runs)} seeds"
+    values, interval = successes(runs), interval_of(runs)
+    known = len(runs) >= stats.FEWEST_SEEDS or all(run.episodes for run in runs)
     return [
         task,
         method,
         str(len(runs)),
         f"{interval.mean:.3f}",
         f"{np.std(values, ddof=1):.3f}" if len(values) > 1 else "-",
-        f"{interval.low:.3f} to {interval.high:.3f}" if len(values) > 1 else "-",
-        _mean(runs, "mean_length_success", "{:.0f}"),
-        _mean(runs, "subgoal_success", "{:.2f}"),
-        _mean(runs, "mean_window", "{:.1f}"),
-        to_90,
-        _mean(runs, "stable_share", "{:.2f}"),
-        _worst(runs),
+        f"{interval.low:.3f} to {interval.high:.3f}" if known else "-",
+        mean_of(runs, "mean_length_success", "{:.0f}"),
+        mean_of(runs, "subgoal_success", "{:.2f}"),
+        mean_of(runs, "mean_window", "{:.1f}"),
+        steps_to_90(runs),
+        mean_of(runs, "stable_share", "{:.2f}"),
+        worst(runs),
     ]
 
 
-def _worst(runs: Sequence[Run]) -> str:
+def steps_to_90(runs: Sequence[Run]) -> str:
+    """Mean steps until an evaluation first succeeds in 0.9 of its episodes, or how many seeds get there."""
+    first = [stats.steps_to(*run.curve, 0.9) for run in runs]
+    reached = [steps for steps in first if steps is not None]
+    all_reached = len(reached) == len(runs)
+    return f"{np.mean(reached) / 1000:.0f} k" if all_reached else f"{len(reached)} of {len(runs)} seeds"
+
+
+def worst(runs: Sequence[Run]) -> str:
+    """The lowest evaluation after a first .9, of all seeds."""
     values = [run.final["worst_after_first_90"] for run in runs if run.final.get("worst_after_first_90") is not None]
     return f"{min(values):.2f}" if values else "-"
 
 
-def _mean(runs: Sequence[Run], key: str, form: str) -> str:
+def mean_of(runs: Sequence[Run], key: str, form: str) -> str:
+    """Mean of a figure over the seeds that have it."""
     values = [run.final[key] for run in runs if run.final.get(key) is not None]
     return form.format(np.mean(values)) if values else "-"
 
 
-def comparison_table(results: Results) -> list[list[str]]:
-    """Ours against each task's strongest baseline: Welch on seeds, Holm over tasks, Cliff's delta, steps saved."""
-    table = [["task", "against", "difference", "p", "p (Holm)", "", "Cliff's delta", "steps saved"]]
-    baselines = {task: strongest_baseline(methods) for task, methods in results.items() if OURS in methods}
-    pairs = {task: name for task, name in baselines.items() if name is not None}
-    ours = {task: successes(results[task][OURS]) for task in pairs}
-    theirs = {task: successes(results[task][name]) for task, name in pairs.items()}
-    for task, c in stats.compare(ours, theirs).items():
-        gain = convergence_gain(results[task][OURS], results[task][pairs[task]])
-        numbers = [f"{c.difference:+.3f}", f"{c.p_value:.3g}", f"{c.p_holm:.3g}", c.mark, f"{c.cliffs_delta:+.2f}"]
-        table.append([task, pairs[task], *numbers, "-" if gain is None else f"{gain:,}"])
+def comparison_table(rows: Sequence[Row]) -> Table:
+    """Comparisons with ours, one per line."""
+    header = ["task", "against", "difference", "p", "p (Holm)", "", "Cliff's delta", "steps saved", "95 % interval"]
+    table = [[*header, "better", "note"]]
+    for row in rows:
+        test = row.test
+        tested = [f"{test.p_value:.3g}", f"{test.p_holm:.3g}"] if test.p_value is not None else ["-", "-"]
+        over_seeds = test.note != stats.TOO_FEW_SEEDS
+        effects = [f"{test.cliffs_delta:+.2f}", f"{test.improvement:.2f}"] if over_seeds else ["-", "-"]
+        gain = "-" if row.gain is None else str(row.gain)
+        interval = f"{row.interval.low:+.3f} to {row.interval.high:+.3f}"
+        note = ", ".join(filter(None, [test.note, "strongest baseline" if row.strongest else ""]))
+        numbers = [f"{test.difference:+.3f}", *tested, test.mark, effects[0], gain, interval, effects[1]]
+        table.append([row.task, row.other, *numbers, note])
     return table
 
 
+def paper_table(results: Results, paper: Paper) -> Table:
+    """Shipped settings beside the paper's figures and the public HiTS policies (table 2)."""
+    table = [
+        ["task", "method", "success", "95 % interval", "seeds", "steps", "steps in the paper", "paper", "public HiTS"]
+    ]
+    for task, methods in results.items():
+        for method, runs in shipped(methods).items():
+            interval = interval_of(runs)
+            said = paper.success(task, method)
+            public = paper.public_hits.get(task) if method == "hits" else None
+            table.append(
+                [
+                    task,
+                    method,
+                    f"{interval.mean:.3f}",
+                    f"{interval.low:.3f} to {interval.high:.3f}",
+                    str(len(runs)),
+                    _steps(runs),
+                    f"{paper.steps[task]:,}" if task in paper.steps else "-",
+                    "-" if said is None else f"{said.mean:.3f} (sd {said.sd:.3f})",
+                    "-" if public is None else f"{public:.2f}",
+                ]
+            )
+    return table
+
+
+def _steps(runs: Sequence[Run]) -> str:
+    steps = sorted({int(run.final["n_timesteps"]) for run in runs if run.final.get("n_timesteps")})
+    return " or ".join(f"{count:,}" for count in steps) or "-"
+
+
+def description_table(task: str, methods: Mapping[str, Sequence[Run]], descriptions: Descriptions) -> Table:
+    """What each row of a task is, its steps, minutes and machine, and what a reader must know of it."""
+    table = [["method", "what it is", "steps", "minutes", "machine", "notes"]]
+    for method, runs in methods.items():
+        minutes = [run.final["wall_time"] / 60 for run in runs if run.final.get("wall_time")]
+        machines = sorted({str(run.versions.get("cpu")) for run in runs if run.versions.get("cpu")})
+        notes = notes_of_row(runs, methods)
+        cells = [describe(descriptions, task, method) or "-", _steps(runs)]
+        cells += [f"{np.mean(minutes):.0f}" if minutes else "-", ", ".join(machines) or "-", "; ".join(notes) or "-"]
+        table.append([method, *cells])
+    return table
+
+
+def spread_table(results: Results) -> Table:
+    """How far seeds lie apart, of the rows with three seeds or more."""
+    table = [["task", "method", "seeds", "lowest", "10th percentile", "90th percentile", "highest"]]
+    for task, methods in results.items():
+        for method, runs in methods.items():
+            if len(runs) >= stats.FEWEST_SEEDS:
+                spread = stats.spread(successes(runs))
+                table.append([task, method, str(len(runs)), *(f"{value:.3f}" for value in spread)])
+    return table
+
+
+def overall_table(results: Results) -> Table:
+    """Interquartile mean of all runs with shipped settings, over the tasks that a method has runs of."""
+    table = [["method", "tasks", "runs", "interquartile mean", "95 % interval"]]
+    names = list(dict.fromkeys(method for methods in results.values() for method in shipped(methods)))
+    for method in names:
+        rows = [methods[method] for methods in results.values() if method in methods]
+        iqm = stats.interquartile_mean([successes(runs) for runs in rows])
+        low, high = iqm.low, iqm.high
+        middle = sum(run.episodes for runs in rows for run in runs) // 2  # episodes of the middle half of the runs
+        if middle:  # runs that all succeed would give an interval of width zero
+            exact = stats.clopper_pearson(round(iqm.mean * middle), middle)
+            low, high = min(low, exact[0]), max(high, exact[1])
+        counts = [str(len(rows)), str(sum(map(len, rows)))]
+        table.append([method, *counts, f"{iqm.mean:.3f}", f"{low:.3f} to {high:.3f}"])
+    return table
+
+
+def conditions_table(results: Results) -> Table:
+    """Baselines that were not run as ours was, and in what they differ (our value in brackets)."""
+    table = [["task", "method", "differs from ours in"]]
+    for task, rows in unequal_conditions(results).items():
+        table += [[task, method, "; ".join(said)] for method, said in rows.items()]
+    return table
+
+
+def all_tables(results: Results) -> dict[str, Table]:
+    """The tables that the command prints, without those that have no row."""
+    tables = {
+        "Success": success_table(results),
+        "Against every baseline": comparison_table(against_baselines(results)),
+        "Against our own ablations": comparison_table(against_ablations(results)),
+        "Not run under equal conditions": conditions_table(results),
+    }
+    return {title: table for title, table in tables.items() if len(table) > 1}
+
+
 def to_text(table: Sequence[Sequence[str]]) -> str:
-    """A table as Markdown with aligned columns."""
-    widths = [max(len(row[i]) for row in table) for i in range(len(table[0]))]
-    lines = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) + " |" for row in table]
+    """A table as Markdown with aligned columns; bars in cells are escaped."""
+    rows = [[cell.replace("|", "\\|") for cell in row] for row in table]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) + " |" for row in rows]
     return "\n".join([lines[0], "|" + "|".join("-" * (w + 2) for w in widths) + "|", *lines[1:]])

@@ -185,7 +185,7 @@ class OptionTraceCallback(BaseCallback):
     :param every: keep one option in so many, to bound the file's size
     """
 
-    HEADER = ("timesteps", "env", "time_budget", "duration", "reached", "reason", "subgoal")
+    HEADER = ("timesteps", "env", "time_budget", "duration", "reached", "reason", "episode_over", "subgoal")
 
     def __init__(self, path: Path, every: int = 1, verbose: int = 0) -> None:
         super().__init__(verbose)
@@ -208,15 +208,15 @@ class OptionTraceCallback(BaseCallback):
                 continue
             self._seen += 1
             if self._seen % self.every == 0:
-                self._write(index, option)
+                self._write(index, option, bool(info.get("episode_over")))
         return True
 
-    def _write(self, index: int, option: dict[str, Any]) -> None:
+    def _write(self, index: int, option: dict[str, Any], episode_over: bool) -> None:
         if self._file is None:
             return
         subgoal = " ".join(f"{x:.4g}" for x in option["subgoal"])
         row = [self.num_timesteps, index, f"{option['time_budget']:.4g}", option["duration"]]
-        row += [int(option["reached"]), option["reason"], subgoal]
+        row += [int(option["reached"]), option["reason"], int(episode_over), subgoal]
         with explained(self.path):
             csv.writer(self._file, lineterminator="\n").writerow(row)
 

@@ -68,7 +68,10 @@ class Episodes(Protocol):
 
 
 def summarise(result: Episodes) -> dict[str, Any]:
-    """What ``evaluate --json`` and ``final.json`` say of an evaluation; undefined means are ``None``, never NaN."""
+    """What ``evaluate --json`` and ``final.json`` say of an evaluation; undefined means are ``None``, never NaN.
+
+    ``outcomes`` has one digit per episode, in order, 1 for a success: the report pairs the episodes of two methods.
+    """
     successes = np.asarray(result.successes, dtype=bool)
     lengths = np.asarray(result.lengths, dtype=np.float64)
     low, high = wilson_interval(int(successes.sum()), len(successes))
@@ -80,6 +83,7 @@ def summarise(result: Episodes) -> dict[str, Any]:
         "mean_length_success": _number(finite_mean(lengths[successes])),
         "subgoal_success": _number(finite_mean(result.subgoal_success)),
         "mean_window": _number(finite_mean(result.mean_window)),
+        "outcomes": "".join("1" if success else "0" for success in successes),
     }
 
 

@@ -139,6 +139,7 @@ def test_option_trace(agent: Agent, tmp_path: Path) -> None:
         "duration": "1",
         "reached": "1",
         "reason": "reached",
+        "episode_over": "0",
         "subgoal": "1.5 -2",
     }
 

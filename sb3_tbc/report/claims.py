@@ -1,0 +1,95 @@
+"""Which of the paper's claims hold in the runs of the ledger, each with its comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from sb3_tbc import stats
+from sb3_tbc.report.comparisons import Row, against_ablations, against_baselines, strongest_baselines
+from sb3_tbc.report.runs import OURS, Results, Run
+
+TIMING_TASKS = ("Drawbridge", "Platforms", "Tennis2D")
+SPATIAL_TASKS = ("AntFourRooms", "UR5Reacher")
+ABLATION_CLAIMS = {
+    f"{OURS} no-ts": ("needs timed subgoals where timing matters", TIMING_TASKS),
+    f"{OURS} no-ndbc": ("needs the circuit where space is complex", SPATIAL_TASKS),
+}
+HOLDS, SAME, OPPOSITE = "holds", "no difference shown", "the opposite"
+
+
+class Claim(NamedTuple):
+    """A claim on one task: the verdict and what it rests on."""
+
+    text: str
+    task: str
+    verdict: str
+    evidence: str
+
+
+def verdict(difference: float, test: stats.Comparison) -> str:
+    """What a comparison says: a direction only where the corrected test is below 0.05."""
+    if test.p_holm is None or test.p_holm >= 0.05:
+        return SAME if not test.note else f"{SAME} ({test.note})"
+    return HOLDS if difference > 0 else OPPOSITE
+
+
+def _of_row(text: str, row: Row) -> Claim:
+    p_value = "no test" if row.test.p_holm is None else f"p (Holm) {row.test.p_holm:.3g}"
+    low, high = row.interval.low, row.interval.high
+    evidence = f"{row.test.difference:+.3f} ({low:+.3f} to {high:+.3f}) against {row.other}; {p_value}"
+    return Claim(text, row.task, verdict(row.test.difference, row.test), evidence)
+
+
+def _stability(results: Results) -> list[Claim]:
+    names = {t: best[0] for t, m in results.items() if OURS in m and (best := strongest_baselines(m))}
+    pairs = {t: (results[t][OURS], results[t][name]) for t, name in names.items()}
+    shares: list[dict[str, list[float]]] = [{t: _shares(pair[side]) for t, pair in pairs.items()} for side in (0, 1)]
+    both = sorted(t for t in pairs if shares[0][t] and shares[1][t])
+    tests = stats.compare(*({t: side[t] for t in both} for side in shares))
+    found: list[Claim] = []
+    text = "learns more stably than the strongest baseline"
+    for task in both:
+        test = tests[task]
+        p_value = "no test" if test.p_holm is None else f"p (Holm) {test.p_holm:.3g}"
+        evidence = f"share of evaluations at 0.9 or more once there: {test.difference:+.2f} "
+        evidence += f"against {names[task]}; {p_value}"
+        found.append(Claim(text, task, verdict(test.difference, test), evidence))
+    return found
+
+
+def _shares(runs: Sequence[Run]) -> list[float]:
+    return [float(r.final["stable_share"]) for r in runs if r.final.get("stable_share") is not None]
+
+
+def _sooner(results: Results) -> list[Claim]:
+    text = "is at the common threshold before the strongest baseline"
+    found = []
+    for row in against_baselines(results):
+        if row.strongest and row.gain is not None:
+            said = f"steps saved to {row.gain.threshold:.2f}: {row.gain}, against {row.other} (mean curves, no test)"
+            found.append(Claim(text, row.task, "yes" if row.gain.ahead else "no", said))
+    return found
+
+
+def _parts(results: Results) -> list[Claim]:
+    rows = {(row.other, row.task): row for row in against_ablations(results)}
+    found = []
+    for ablation, (text, tasks) in ABLATION_CLAIMS.items():
+        for task in (task for task in tasks if OURS in results.get(task, {})):
+            row = rows.get((ablation, task))
+            missing = Claim(text, task, "not run", f"the ledger has no {ablation} on this task")
+            found.append(missing if row is None else _of_row(text, row))
+    return found
+
+
+def claims(results: Results) -> list[Claim]:
+    """The paper's claims (section 5), task by task."""
+    best = "ends with a higher success rate than the strongest baseline"
+    found = [_of_row(best, row) for row in against_baselines(results) if row.strongest]
+    return found + _sooner(results) + _stability(results) + _parts(results)
+
+
+def claims_table(results: Results) -> list[list[str]]:
+    """The claims as cells."""
+    return [["TBC-HRL ...", "task", "verdict", "evidence"], *(list(claim) for claim in claims(results))]

@@ -1,0 +1,152 @@
+"""Ours against every baseline and against its own ablations: tests, intervals, environment steps saved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_tbc import stats
+from sb3_tbc.report.runs import OURS, Results, Run, is_shipped, on_union_of_steps, shipped, successes
+from sb3_tbc.zoo.config import ABLATIONS
+
+BLOCK = 10
+"""Episodes in a block of the paired bootstrap: those that are evaluated side by side."""
+CONVERGED = 0.5
+"""Where no method comes this far, the paper reports no convergence gain (Tennis2D), and neither do we."""
+
+
+class Gain(NamedTuple):
+    """Environment steps until the mean curve first reaches a threshold; ``None`` where it never does."""
+
+    threshold: float
+    ours: int | None
+    theirs: int | None
+    until: int  # steps that the other method was trained for
+
+    @property
+    def ahead(self) -> bool:
+        """Whether ours is there first."""
+        return self.ours is not None and (self.theirs is None or self.ours < self.theirs)
+
+    def __str__(self) -> str:
+        if self.ours is not None and self.theirs is not None:
+            return f"{self.theirs - self.ours:,}"
+        if self.ours is not None:
+            return f"not reached in {self.until:,}"
+        return "ours does not reach it" if self.theirs is not None else "-"
+
+
+class Row(NamedTuple):
+    """One comparison of ours with another row of a task."""
+
+    task: str
+    other: str
+    interval: stats.Interval
+    test: stats.Comparison
+    gain: Gain | None
+    strongest: bool
+
+
+def interval_of(runs: Sequence[Run]) -> stats.Interval:
+    """Mean final success over seeds and its interval, never of width zero where the episodes are known."""
+    episodes = [run.episodes for run in runs]
+    if not all(episodes):
+        return stats.bootstrap_mean(successes(runs))
+    return stats.success_interval(successes(runs), episodes)
+
+
+def difference_of(first: Sequence[Run], second: Sequence[Run]) -> stats.Interval:
+    """Difference of the mean success and its interval.
+
+    With fewer than three seeds on a side the episodes are resampled in pairs where both sides recorded them on the same
+    evaluation seeds (paper, section 5.1); the interval is never narrower than the one combined from both sides.
+    """
+    combined = stats.difference(interval_of(first), interval_of(second))
+    if min(len(first), len(second)) >= stats.FEWEST_SEEDS:
+        return combined
+    theirs = {run.final.get("eval_seed"): run.outcomes for run in second}
+    pairs = [(run.outcomes, theirs.get(run.final.get("eval_seed"))) for run in first]
+    whole = [(a, b) for a, b in pairs if a and b and len(a) == len(b)]
+    if len(whole) < max(len(first), len(second)):
+        return combined
+    paired = stats.paired_block_bootstrap([a for a, _ in whole], [b for _, b in whole], BLOCK)
+    return stats.Interval(combined.mean, min(combined.low, paired.low), max(combined.high, paired.high))
+
+
+def mean_curve(runs: Sequence[Run]) -> tuple[list[int], list[float]] | None:
+    """Mean success over seeds at all evaluated steps; ``None`` without curves."""
+    curves = [run.curve for run in runs if run.rows]
+    if not curves:
+        return None
+    steps, values = on_union_of_steps(curves)
+    return steps.astype(int).tolist(), values.mean(axis=0).tolist()
+
+
+def common_threshold(methods: Mapping[str, Sequence[Run]]) -> float | None:
+    """0.9 of the best mean success that any method with shipped settings reaches on the way.
+
+    The best method sets it, so one that never learns cannot meet it. ``None`` where none reaches :data:`CONVERGED`.
+    """
+    curves = [curve for runs in shipped(methods).values() if (curve := mean_curve(runs))]
+    best = max((max(rates) for _, rates in curves if rates), default=0.0)
+    return 0.9 * best if best >= CONVERGED else None
+
+
+def convergence_gain(ours: Sequence[Run], theirs: Sequence[Run], threshold: float | None) -> Gain | None:
+    """Environment steps that ours saves on the way to a threshold; ``None`` without curves or threshold."""
+    curves = mean_curve(ours), mean_curve(theirs)
+    if threshold is None or curves[0] is None or curves[1] is None:
+        return None
+    ours_at, theirs_at = stats.steps_to(*curves[0], threshold), stats.steps_to(*curves[1], threshold)
+    return Gain(threshold, ours_at, theirs_at, max(run.rows[-1].timesteps for run in theirs if run.rows))
+
+
+def baselines(methods: Mapping[str, Sequence[Run]]) -> list[str]:
+    """Methods that ours is compared with: shipped settings of other algorithms, no variant, no ablation."""
+    return [method for method in methods if is_shipped(method) and method != OURS]
+
+
+def strongest_baselines(methods: Mapping[str, Sequence[Run]]) -> list[str]:
+    """The baseline with the best mean success; of equals, the one that is first at the common threshold.
+
+    :return: more than one where they are equal in both, none without a baseline
+    """
+    threshold = common_threshold(methods)
+
+    def rank(method: str) -> tuple[float, float]:
+        curve = mean_curve(methods[method])
+        steps = stats.steps_to(*curve, threshold) if curve and threshold is not None else None
+        return float(np.mean(successes(methods[method]))), -np.inf if steps is None else -steps
+
+    ranks = {method: rank(method) for method in baselines(methods)}
+    return [method for method, found in ranks.items() if found == max(ranks.values())]
+
+
+def _rows(results: Results, others: Mapping[str, Sequence[str]]) -> list[Row]:
+    """Compare ours with named rows of each task; the p-values are corrected over all of them."""
+    keys = [(task, name) for task, names in others.items() for name in names]
+    tests = stats.compare(
+        {key: successes(results[key[0]][OURS]) for key in keys},
+        {key: successes(results[key[0]][key[1]]) for key in keys},
+    )
+    rows = []
+    for task, name in keys:
+        ours, theirs = results[task][OURS], results[task][name]
+        gain = convergence_gain(ours, theirs, common_threshold(results[task]))
+        strongest = name in strongest_baselines(results[task])
+        rows.append(Row(task, name, difference_of(ours, theirs), tests[task, name], gain, strongest))
+    return rows
+
+
+def against_baselines(results: Results) -> list[Row]:
+    """Ours against every baseline of every task (table 2)."""
+    return _rows(results, {task: baselines(methods) for task, methods in results.items() if OURS in methods})
+
+
+def against_ablations(results: Results) -> list[Row]:
+    """Ours against its own ablations (table 3)."""
+    names = [f"{OURS} {ablation}" for ablation in sorted(ABLATIONS)]
+    found = {t: [n for n in names if n in methods] for t, methods in results.items() if OURS in methods}
+    return _rows(results, found)

@@ -1,0 +1,92 @@
+"""What must be the same for all methods of a task, and which rows differ in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from sb3_tbc.report.runs import OURS, Results, Run, shipped
+
+TWO_LEVELS = ("tbc-hrl", "hits", "hac")
+
+
+def _level(run: Run, level: str, key: str) -> Any:
+    """A setting of a level, or of the agent itself where it has one level."""
+    model = run.config.get("model") or {}
+    return (model.get(level) or model).get(key)
+
+
+def _averaging(run: Run) -> str:
+    decays = [_level(run, level, "average_decay") for level in ("high", "low")]
+    return "default" if decays == [None, None] else " and ".join(str(decay) for decay in decays)
+
+
+def _subgoal_view(run: Run) -> str | None:
+    if run.final["algo"] not in TWO_LEVELS:
+        return None
+    return "relative" if (run.config.get("model") or {}).get("relative_subgoals") else "absolute"
+
+
+CONDITIONS: dict[str, Callable[[Run], Any]] = {
+    "observation": lambda run: (run.config.get("env_kwargs") or {}).get("observation", "paper"),
+    "subgoals seen": _subgoal_view,
+    "training steps": lambda run: run.config.get("n_timesteps", run.final.get("n_timesteps")),
+    "environments": lambda run: run.config.get("n_envs", 1),
+    "updates per step": lambda run: (run.config.get("model") or {}).get("gradient_ratio", 1.0),
+    "weight averaging": _averaging,
+    "settings": lambda run: run.final.get("config"),
+    "steps between evaluations": lambda run: run.config.get("eval_freq"),
+    "episodes per evaluation": lambda run: run.config.get("n_eval_episodes"),
+    "final episodes": lambda run: run.config.get("n_final_episodes", run.final.get("n_episodes")),
+}
+"""Name of a condition -> its value for a run; ``None`` where it does not apply."""
+
+
+def condition_values(runs: Sequence[Run]) -> dict[str, list[Any]]:
+    """Values of each condition over the seeds of a row, each once, in order of appearance."""
+    return {
+        name: list(dict.fromkeys(v for run in runs if run.config and (v := value(run)) is not None))
+        for name, value in CONDITIONS.items()
+    }
+
+
+def differences(runs: Sequence[Run], reference: Sequence[Run]) -> list[str]:
+    """In what a row differs from another one, and in what its own seeds differ: ``name: value (other value)``."""
+    found = []
+    other = condition_values(reference)
+    for name, values in condition_values(runs).items():
+        if len(values) > 1:
+            found.append(f"{name}: {' or '.join(map(_said, values))}, depending on the seed")
+        elif values and other[name] and values != other[name]:
+            found.append(f"{name}: {_said(values[0])} ({' or '.join(map(_said, other[name]))})")
+    return found
+
+
+def _said(value: Any) -> str:
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
+
+
+def unequal_conditions(results: Results) -> dict[str, dict[str, list[str]]]:
+    """Task -> baseline -> in what it differs from our row, which is the reference; equal rows are left out."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for task, methods in results.items():
+        rows = shipped(methods)
+        if OURS not in rows:
+            continue
+        lines = {method: differences(runs, rows[OURS]) for method, runs in rows.items()}
+        found[task] = {method: said for method, said in lines.items() if said}
+    return {task: rows for task, rows in found.items() if rows}
+
+
+def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]]) -> list[str]:
+    """What a reader of a single row must know: unequal conditions, and code that differs from its commit.
+
+    :param runs: the row
+    :param reference: the task's rows, of which ours is compared with
+    """
+    notes = differences(runs, reference[OURS]) if OURS in reference else []
+    dirty = [run.seed for run in runs if run.versions and run.dirty]
+    if dirty:
+        seeds = "all seeds" if len(dirty) == len(runs) else "seed " + ", ".join(map(str, dirty))
+        notes.append(f"{seeds}: code with changes that were not committed")
+    return notes

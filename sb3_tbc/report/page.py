@@ -1,0 +1,229 @@
+"""The page: one HTML file that needs nothing else, readable without scripts, on a phone, in light and dark."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+
+from sb3_tbc.report import curves, tables
+from sb3_tbc.report.claims import claims_table
+from sb3_tbc.report.comparisons import against_ablations, against_baselines
+from sb3_tbc.report.conditions import notes_of_row
+from sb3_tbc.report.paper import Figure, Paper
+from sb3_tbc.report.runs import Results, Run, describe, is_shipped
+from sb3_tbc.report.timeline import TRACE, last_episode, option_timeline
+
+TEXT_COLUMNS = ("what it is", "notes", "note", "differs from ours in", "evidence", "machine", "verdict")
+INTRODUCTION = (
+    "Rows without a further name have the shipped settings. Lines are means over seeds, bands their 95 % bootstrap "
+    "intervals, dots every measured evaluation. Point at a curve to read it, at a name to bring its line out."
+)
+
+
+def to_html(
+    results: Results, descriptions: Mapping[str, Mapping[str, str]], paper: Paper, failed: Sequence[Path], out: Path
+) -> str:
+    """The whole page.
+
+    :param results: finished runs
+    :param descriptions: what the rows are
+    :param paper: the paper's figures
+    :param failed: folders of runs that ended in an error
+    :param out: where the page will lie, for links to films
+    """
+    style, script = (_template(name) for name in ("page.css", "page.js"))
+    body = [
+        *_heading(results, failed),
+        "<h2>Learning curves</h2>",
+        *_figures(results, descriptions, paper),
+        *_section("Beside the paper", tables.paper_table(results, paper), paper.source),
+        *_section(
+            "Against every baseline", tables.comparison_table(against_baselines(results)), tables.COMPARISON_NOTES
+        ),
+        *_section("Against our own ablations", tables.comparison_table(against_ablations(results)), ""),
+        *_section("Which of the paper's claims hold here", claims_table(results), ""),
+        *_section("Not run under equal conditions", tables.conditions_table(results), "Our value in brackets."),
+        *_section(
+            "All tasks together", tables.overall_table(results), "Shipped settings; seeds resampled within tasks."
+        ),
+        *_section("All rows", tables.success_table(results), tables.NOTES),
+        *_section(
+            "How far seeds lie apart", tables.spread_table(results), "Final success, rows of three seeds or more."
+        ),
+        "<h2>How each row was made</h2>",
+        *_rows(results, descriptions),
+        *_films(results, out),
+    ]
+    return "\n".join(
+        [
+            '<!doctype html><html lang="en"><head><meta charset="utf-8">',
+            '<meta name="viewport" content="width=device-width, initial-scale=1">',
+            f"<title>sb3_tbc results</title><style>{style}</style></head><body>",
+            *body,
+            f"<script>{script}</script></body></html>",
+            "",
+        ]
+    )
+
+
+def _template(name: str) -> str:
+    return resources.files("sb3_tbc.report").joinpath("templates", name).read_text(encoding="utf-8")
+
+
+def _heading(results: Results, failed: Sequence[Path]) -> list[str]:
+    runs = [run for methods in results.values() for rows in methods.values() for run in rows]
+    hours = sum(float(run.final.get("wall_time") or 0.0) for run in runs) / 3600
+    dirty = sum(run.dirty for run in runs if run.versions)
+    facts = [f"{len(runs)} finished runs on {len(results)} tasks", f"{hours:.1f} hours of training"]
+    facts.append(f"{len(failed)} failed runs" if failed else "no failed runs")
+    if dirty:
+        facts.append(f"{dirty} runs from code with changes that were not committed, marked below")
+    names = ", ".join(escape("/".join(path.parts[-4:])) for path in failed)
+    return [
+        "<h1>Results</h1>",
+        f"<p>{'; '.join(facts)}.</p>",
+        *([f"<p>Failed: {names}</p>"] if names else []),
+        f'<p class="soft">{INTRODUCTION}</p>',
+        '<p class="bar"><label><input type="checkbox" id="variants" disabled> show variants and ablations</label>'
+        '<button id="theme" type="button" hidden>light or dark</button></p>',
+    ]
+
+
+def _figures(results: Results, descriptions: Mapping[str, Mapping[str, str]], paper: Paper) -> list[str]:
+    parts = ['<div class="figures">']
+    marks = {(row.task, row.other): row.test.mark for row in against_baselines(results)}
+    frame = f"{curves.LEFT} {curves.RIGHT} {curves.TOP} {curves.BOTTOM}"
+    for task, methods in results.items():
+        drawn = curves.figure(task, methods, paper)
+        if not drawn:
+            continue
+        named = {method: runs for method, runs in methods.items() if any(run.rows for run in runs)}
+        parts.append(f'<section data-frame="{frame}"><h3>{escape(task)}</h3>{drawn}')
+        parts.append('<div class="said" aria-live="polite"></div>')
+        said = paper.success(task, "tbc-hrl")
+        parts.append(f'<div class="key">{_key(task, named, descriptions, marks)}{_paper_key(said)}</div></section>')
+    return [*parts, "</div>"]
+
+
+def _paper_key(said: Figure | None) -> str:
+    if said is None:
+        return ""
+    line = '<svg viewBox="0 0 26 10"><line class="paper" x1="1" x2="26" y1="5" y2="5"/></svg>'
+    return f"<span>{line}tbc-hrl in the paper: {said.mean:.3f}</span>"
+
+
+def _key(
+    task: str,
+    methods: Mapping[str, Sequence[Run]],
+    descriptions: Mapping[str, Mapping[str, str]],
+    marks: Mapping[tuple[str, str], str],
+) -> str:
+    """Names of the curves, each with a box that shows or hides it, and the mark of its test against ours."""
+    style = curves.Style(list(methods))
+    parts = []
+    for method in curves.shipped_first(methods):
+        kind = ' class="variant" hidden' if not is_shipped(method) else ""
+        checked = " checked" if is_shipped(method) else ""
+        dash = f' stroke-dasharray="{style.dash[method]}"' if style.dash[method] else ""
+        count = len(methods[method])
+        said = escape(describe(descriptions, task, method), quote=True)
+        name = f"{method} ({count} seed{'s' if count > 1 else ''}) {marks.get((task, method), '')}".strip()
+        parts.append(
+            f'<label{kind} style="--c:{style.colour[method]}" title="{said}">'
+            f'<input type="checkbox" value="{escape(method, quote=True)}" disabled{checked}>'
+            f"<b>{style.label[method]}</b>"
+            f'<svg viewBox="0 0 26 10"><line class="mean" x1="0" x2="26" y1="5" y2="5"{dash}/></svg>'
+            f"{escape(name)}</label>"
+        )
+    return "".join(parts)
+
+
+def _section(title: str, table: Sequence[Sequence[str]], note: str) -> list[str]:
+    if len(table) < 2:
+        return []
+    said = [f'<p class="soft">{escape(note)}</p>'] if note else []
+    return [f"<h2>{escape(title)}</h2>", *said, html_table(table)]
+
+
+def html_table(table: Sequence[Sequence[str]]) -> str:
+    """A table whose texts are escaped; rows of variants can be filtered."""
+    header, *rows = table
+    wraps = [name in TEXT_COLUMNS for name in header]
+    method = header.index("method") if "method" in header else None
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        return "".join(
+            f"<{tag}{' class=text' if wrap else ''}>{escape(cell)}</{tag}>"
+            for cell, wrap in zip(cells, wraps, strict=True)
+        )
+
+    parts = [f'<div class="scroll"><table><thead><tr>{line(header, "th")}</tr></thead><tbody>']
+    for cells in rows:
+        variant = method is not None and not is_shipped(cells[method])
+        parts.append(f"<tr{' class=variant hidden' if variant else ''}>{line(cells, 'td')}</tr>")
+    return "".join([*parts, "</tbody></table></div>"])
+
+
+def _rows(results: Results, descriptions: Mapping[str, Mapping[str, str]]) -> list[str]:
+    parts = []
+    for task, methods in results.items():
+        parts.append(f"<h3>{escape(task)}</h3>")
+        for method, runs in methods.items():
+            parts.append(_row(task, method, runs, methods, descriptions))
+    return parts
+
+
+def _row(
+    task: str,
+    method: str,
+    runs: Sequence[Run],
+    methods: Mapping[str, Sequence[Run]],
+    descriptions: Mapping[str, Mapping[str, str]],
+) -> str:
+    kind = "" if is_shipped(method) else ' class="variant" hidden'
+    said = describe(descriptions, task, method)
+    notes = "".join(f"<li>{escape(note)}</li>" for note in notes_of_row(runs, methods))
+    lines = [f"<details{kind}><summary>{escape(method)}{': ' + escape(said) if said else ''}</summary>"]
+    lines += [f"<ul>{notes}</ul>"] if notes else []
+    for run in runs:
+        packages = run.versions.get("packages") or {}
+        parts = [f"{name} {version}" for name, version in packages.items()]
+        parts += [f"commit {run.commit}"] if run.versions else []
+        parts += [str(run.versions[key]) for key in ("python", "cpu") if run.versions.get(key)]
+        lines.append(f"<p>seed {run.seed}: <code>{escape(run.command or 'command unknown')}</code><br>")
+        lines.append(f'<span class="soft">{escape(", ".join(parts))}</span></p>')
+    return "".join([*lines, "</details>"])
+
+
+def _films(results: Results, out: Path) -> list[str]:
+    """Films beside the page or in a run's folder, and the options of runs that were traced."""
+    parts = []
+    beside = sorted(out.absolute().parent.glob("*.mp4"))
+    parts += [_film(path, out) for path in beside]
+    for task, methods in results.items():
+        for method, runs in methods.items():
+            for run in runs:
+                title = f"{task}, {method}, seed {run.seed}"
+                films = [path for path in sorted(run.folder.absolute().glob("*.mp4")) if path not in beside]
+                parts += [f"<h3>{escape(title)}</h3>{_film(path, out)}" for path in films]
+                parts += _timeline(run.folder / TRACE, title)
+    return ["<h2>Films and options</h2>", *parts] if parts else []
+
+
+def _film(path: Path, out: Path) -> str:
+    link = escape(os.path.relpath(path, out.absolute().parent), quote=True)
+    return f'<p><video controls loop preload="metadata" src="{link}"></video><br><span class="soft">{link}</span></p>'
+
+
+def _timeline(trace: Path, title: str) -> list[str]:
+    options = last_episode(trace) if trace.is_file() else []
+    if not options:
+        return []
+    note = "The last whole episode of training. Pale: time budget; dark: steps used; tick: subgoal reached, cross: not."
+    return [
+        f'<h3>{escape(title)}: options of an episode</h3><p class="soft">{note}</p>',
+        option_timeline(options, f"Options of an episode, {title}"),
+    ]

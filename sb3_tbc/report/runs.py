@@ -1,0 +1,181 @@
+"""Finished runs of a folder: what each says of itself, and what a row of the tables is called."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+import yaml
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.zoo.callbacks import EvaluationRow
+from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
+
+OURS = "tbc-hrl"
+SHIPPED = "full"
+"""Variant of runs with the shipped settings; runs of any other variant are never a baseline."""
+DESCRIPTIONS = "descriptions.yml"
+"""In the folder of results: task -> method -> one line; under ``default``: variant -> one line."""
+
+
+class Curve(NamedTuple):
+    """Success rate against environment steps of one seed."""
+
+    timesteps: Sequence[float]
+    success_rate: Sequence[float]
+
+
+class Run(NamedTuple):
+    """A finished run: its ``final.json``, learning curve, configuration, command and versions."""
+
+    final: dict[str, Any]
+    rows: list[EvaluationRow]
+    config: Mapping[str, Any] = MappingProxyType({})
+    command: str = ""
+    versions: Mapping[str, Any] = MappingProxyType({})
+    folder: Path = Path()
+
+    @property
+    def method(self) -> str:
+        """The algorithm, with the variant where it is not the shipped one."""
+        algo, variant = str(self.final["algo"]), str(self.final["variant"])
+        return algo if variant == SHIPPED else f"{algo} {variant}"
+
+    @property
+    def curve(self) -> Curve:
+        """Success rate against steps."""
+        return Curve([row.timesteps for row in self.rows], [row.success_rate for row in self.rows])
+
+    @property
+    def seed(self) -> int:
+        """The training seed."""
+        return int(self.final.get("seed", 0))
+
+    @property
+    def episodes(self) -> int:
+        """Episodes of the final evaluation, 0 where the run does not say."""
+        return int(self.final.get("n_episodes") or 0)
+
+    @property
+    def outcomes(self) -> list[int] | None:
+        """Success of each episode of the final evaluation in order, where the run recorded it."""
+        text = self.final.get("outcomes")
+        return [int(digit) for digit in text] if isinstance(text, str) and text else None
+
+    @property
+    def commit(self) -> str:
+        """Commit of the code, with ``+`` where files differed from it; ``unknown`` outside a checkout."""
+        return str(self.versions.get("commit") or "unknown")
+
+    @property
+    def dirty(self) -> bool:
+        """Whether the code cannot be told from the commit."""
+        return self.commit.endswith("+") or self.commit == "unknown"
+
+
+Results = dict[str, dict[str, list[Run]]]
+"""Task -> method -> runs, one per seed."""
+
+
+def load_results(root: Path) -> Results:
+    """All finished runs below a folder.
+
+    :raises ConfigError: if there is none or one cannot be read
+    """
+    results: Results = defaultdict(lambda: defaultdict(list))
+    for folder in finished_runs(root):
+        try:
+            run = _load(folder)
+            results[str(run.final["task"])][run.method].append(run)
+        except (KeyError, ValueError, TypeError) as error:
+            raise ConfigError(f"cannot read the run in {folder.path}: {error}") from error
+    if not results:
+        raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
+    return {
+        task: {m: sorted(methods[m], key=lambda run: run.seed) for m in sorted(methods, key=_rank)}
+        for task, methods in sorted(results.items())
+    }
+
+
+def _load(folder: RunFolder) -> Run:
+    final = folder.read_final()
+    rate = final.get("success_rate")
+    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 <= rate <= 1.0:
+        raise ValueError(f"success_rate must be a number from 0 to 1, got {rate!r}")
+    config = folder.read_config() if folder.exists else {}
+    command = _text(folder.path / COMMAND).strip()
+    versions = json.loads(_text(folder.path / VERSIONS) or "{}")
+    return Run(final, folder.read_evaluations(), config, command, versions, folder.path)
+
+
+def _text(path: Path) -> str:
+    return path.read_text(encoding="utf-8") if path.is_file() else ""
+
+
+def _rank(method: str) -> tuple[bool, str]:
+    return not method.startswith(OURS), method
+
+
+def failed_runs(root: Path) -> list[Path]:
+    """Folders of runs that ended in an error, as ``reproduce`` marks them, and that have not been run again since."""
+    return [p.parent for p in sorted(root.glob("*/*/*/seed_*/failed.json")) if not (p.parent / "final.json").is_file()]
+
+
+def is_shipped(method: str) -> bool:
+    """Whether a row has the shipped settings of its algorithm."""
+    return " " not in method
+
+
+def shipped(methods: Mapping[str, Sequence[Run]]) -> dict[str, Sequence[Run]]:
+    """The rows with shipped settings: ours and the baselines, no variant and no ablation."""
+    return {method: runs for method, runs in methods.items() if is_shipped(method)}
+
+
+def successes(runs: Sequence[Run]) -> list[float]:
+    """Final success rate of each seed."""
+    return [float(run.final["success_rate"]) for run in runs]
+
+
+def load_descriptions(root: Path) -> dict[str, dict[str, str]]:
+    """What the rows are, in a line each; none where the folder has no such file.
+
+    :raises ConfigError: if the file cannot be read
+    """
+    path = root / DESCRIPTIONS
+    if not path.is_file():
+        return {}
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return {str(task): {str(k): str(v) for k, v in lines.items()} for task, lines in data.items()}
+    except (OSError, yaml.YAMLError, AttributeError) as error:
+        raise ConfigError(f"cannot read {path}: {error}") from error
+
+
+def describe(descriptions: Mapping[str, Mapping[str, str]], task: str, method: str) -> str:
+    """The line of a row: the task's own, else that of the method or the variant in general, else empty."""
+    general = descriptions.get("default", {})
+    variant = method.partition(" ")[2]
+    return descriptions.get(task, {}).get(method) or general.get(method) or general.get(variant) or ""
+
+
+def on_union_of_steps(curves: Sequence[Curve]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Curves at all steps at which any of them was evaluated, between the last beginning and the first end.
+
+    Between its own points a curve is a straight line. Every measured value within the range is kept, so no extreme is
+    lost, whatever the steps of the seeds are.
+
+    :param curves: one per seed, each with at least one point
+    :return: steps ``(n_points,)`` and values ``(n_seeds, n_points)``
+    :raises ValueError: if there is no curve or one is empty
+    """
+    if not curves or any(len(c.timesteps) == 0 for c in curves):
+        raise ValueError(f"need curves with points, got lengths {[len(c.timesteps) for c in curves]}")
+    first, last = max(c.timesteps[0] for c in curves), min(c.timesteps[-1] for c in curves)
+    steps = np.unique(np.concatenate([np.asarray(c.timesteps, dtype=np.float64) for c in curves]))
+    steps = steps[(steps >= first) & (steps <= last)]
+    return steps, np.stack([np.interp(steps, c.timesteps, c.success_rate) for c in curves])

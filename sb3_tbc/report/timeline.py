@@ -1,0 +1,72 @@
+"""The options of one training episode as bars, from the ``options.csv`` that ``train --trace`` writes."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+TRACE = "options.csv"
+MOST = 40
+"""Options that are drawn; of a longer episode the first ones."""
+
+
+def last_episode(path: Path) -> list[dict[str, Any]]:
+    """The options of the last whole episode of the first environment in a trace, in order.
+
+    :return: ``time_budget``, ``duration`` (environment steps), ``reached``, ``reason``; empty without a whole episode
+    :raises ValueError: if the file has other columns
+    """
+    episodes: list[list[dict[str, Any]]] = []
+    open_one: list[dict[str, Any]] = []
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        if not {"env", "time_budget", "duration", "reached", "reason", "episode_over"} <= set(reader.fieldnames or ()):
+            raise ValueError(f"{path} is no trace of options: its columns are {reader.fieldnames}")
+        for row in reader:
+            if row["env"] != "0":
+                continue
+            open_one.append({
+                "time_budget": float(row["time_budget"]), "duration": int(row["duration"]),
+                "reached": row["reached"] == "1", "reason": row["reason"],
+            })  # fmt: skip
+            if row["episode_over"] == "1":
+                episodes, open_one = [open_one], []
+    return episodes[-1] if episodes else []
+
+
+def option_timeline(options: Sequence[dict[str, Any]], title: str = "") -> str:
+    """Options of one episode from top to bottom: the budget as a pale bar, the steps used as a dark one.
+
+    Reached subgoals have a tick at the end of their bar, missed ones a cross: told apart without colour.
+
+    :param options: as :func:`last_episode` gives them
+    :param title: what is shown, for screen readers
+    :return: SVG text
+    """
+    shown = list(options)[:MOST]
+    starts = [sum(o["duration"] for o in shown[:i]) for i in range(len(shown))]
+    total = max([s + max(o["duration"], o["time_budget"]) for s, o in zip(starts, shown, strict=True)] or [1])
+    height = 14 * len(shown) + 44
+    parts = [f'<svg class="timeline" viewBox="0 0 440 {height}" role="img" aria-label="{escape(title, quote=True)}">']
+    for index, (start, option) in enumerate(zip(starts, shown, strict=True)):
+        y, x, scale = 8 + 14 * index, 34 + 380 * start / total, 380 / total
+        kind, sign = ("reached", "&#10003;") if option["reached"] else ("missed", "&#215;")
+        said = f"option {index + 1}: {option['duration']} of {option['time_budget']:.4g} steps, "
+        said += f"subgoal {'reached' if option['reached'] else 'missed'} ({option['reason']})"
+        end = x + max(option["duration"], option["time_budget"]) * scale
+        parts.append(
+            f'<g class="option {kind}"><title>{escape(said)}</title>'
+            f'<text x="28" y="{y + 9}" text-anchor="end">{index + 1}</text>'
+            f'<rect class="budget" x="{x:.1f}" y="{y}" width="{option["time_budget"] * scale:.1f}" height="11"/>'
+            f'<rect class="used" x="{x:.1f}" y="{y + 3}" width="{option["duration"] * scale:.1f}" height="5"/>'
+            f'<text x="{end + 3:.1f}" y="{y + 9}">{sign}</text></g>'
+        )
+    foot = 8 + 14 * len(shown)
+    for quarter in range(5):
+        x = 34 + 95 * quarter
+        parts.append(f'<text x="{x}" y="{foot + 14}" text-anchor="middle">{total * quarter / 4:.0f}</text>')
+    parts.append(f'<text x="224" y="{foot + 30}" text-anchor="middle">environment step of the episode</text></svg>')
+    return "\n".join(parts)

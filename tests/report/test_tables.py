@@ -1,0 +1,224 @@
+"""Tables from made-up runs: what is compared with what, and figures that a plausible mistake would change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from made_up_runs import fake_run
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.report import tables
+from sb3_tbc.report.claims import HOLDS, SAME, claims
+from sb3_tbc.report.comparisons import (
+    against_ablations,
+    against_baselines,
+    baselines,
+    common_threshold,
+    convergence_gain,
+    difference_of,
+    interval_of,
+    strongest_baselines,
+)
+from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
+from sb3_tbc.report.paper import load_paper
+from sb3_tbc.report.runs import Curve, describe, load_descriptions, load_results, on_union_of_steps
+
+ROOT = Path(__file__).parents[2]
+
+
+def row_of(root: Path, method: str) -> dict[str, str]:
+    header, *rows = tables.success_table(load_results(root))
+    (found,) = [row for row in rows if row[1] == method]
+    return dict(zip(header, found, strict=True))
+
+
+def test_final_success_is_the_last_evaluation_not_the_best(tmp_path: Path) -> None:
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4, curve=[0.2, 1.0, 0.5, 0.4], best_success_rate=1.0)
+    assert row_of(tmp_path, "tbc-hrl")["success"] == "0.400"
+
+
+def test_worst_is_the_lowest_of_all_seeds_not_their_mean(tmp_path: Path) -> None:
+    for seed, lowest in enumerate((0.9, 0.2, 0.7)):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, worst_after_first_90=lowest)
+    fake_run(tmp_path, "A", "hits", 0, 0.5)
+    assert row_of(tmp_path, "tbc-hrl")["worst"] == "0.20"
+    assert row_of(tmp_path, "hits")["worst"] == "-"
+
+
+def test_the_interval_resamples_seeds_not_episodes(tmp_path: Path) -> None:
+    for seed in range(4):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, float(seed % 2))
+    assert row_of(tmp_path, "tbc-hrl")["95 % interval"] == "0.000 to 1.000"  # 400 episodes alone: .45 to .55
+
+
+def test_seeds_that_all_succeed_leave_some_doubt(tmp_path: Path) -> None:
+    for seed in range(5):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0)
+    assert row_of(tmp_path, "tbc-hrl")["95 % interval"] == "0.993 to 1.000"
+    overall = tables.overall_table(load_results(tmp_path))[1]
+    assert overall[-1] == "0.985 to 1.000"
+
+
+def test_variants_and_ablations_never_are_baselines(tmp_path: Path) -> None:
+    for seed in range(3):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.8 + seed / 100)
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, variant="no-ts")
+        fake_run(tmp_path, "A", "hits", seed, 0.5)
+        fake_run(tmp_path, "A", "hits", seed, 1.0, variant="searched")
+        fake_run(tmp_path, "A", "sac", seed, 0.3)
+    methods = load_results(tmp_path)["A"]
+    assert baselines(methods) == ["hits", "sac"]
+    assert strongest_baselines(methods) == ["hits"]
+    assert common_threshold(methods) == pytest.approx(0.9 * 0.81)
+
+
+def test_of_equal_baselines_the_fastest_is_the_strongest(tmp_path: Path) -> None:
+    """HAC is first in the alphabet and slow; the figure against it would be a gift."""
+    for seed in range(3):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, curve=[0.0, 1.0, 1.0, 1.0])
+        fake_run(tmp_path, "A", "hac", seed, 1.0, curve=[0.0, 0.0, 0.0, 1.0])
+        fake_run(tmp_path, "A", "hits", seed, 1.0, curve=[1.0, 1.0, 1.0, 1.0])
+        fake_run(tmp_path, "A", "sac", seed, 1.0, curve=[1.0, 1.0, 1.0, 1.0])
+    results = load_results(tmp_path)
+    assert strongest_baselines(results["A"]) == ["hits", "sac"]
+    gains = {row.other: str(row.gain) for row in against_baselines(results)}
+    assert gains == {"hac": "2,000", "hits": "-1,000", "sac": "-1,000"}
+
+
+def test_a_method_that_never_learns_meets_no_threshold(tmp_path: Path) -> None:
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
+    fake_run(tmp_path, "A", "sac", 0, 0.0)
+    methods = load_results(tmp_path)["A"]
+    gain = convergence_gain(methods["tbc-hrl"], methods["sac"], common_threshold(methods))
+    assert gain is not None
+    assert (gain.ours, gain.theirs, str(gain)) == (4000, None, "not reached in 4,000")
+    fake_run(tmp_path, "B", "tbc-hrl", 0, 0.3)
+    fake_run(tmp_path, "B", "sac", 0, 0.0)
+    assert common_threshold(load_results(tmp_path)["B"]) is None  # nobody converges: no gain is reported
+
+
+def test_comparisons_are_tested_over_seeds_and_corrected_together(tmp_path: Path) -> None:
+    for seed, noise in enumerate((0.0, 0.01, 0.02)):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.95 + noise)
+        fake_run(tmp_path, "A", "hits", seed, 0.80 + noise)
+        fake_run(tmp_path, "A", "hac", seed, 0.30 + noise)
+    fake_run(tmp_path, "B", "tbc-hrl", 0, 1.0)
+    fake_run(tmp_path, "B", "hits", 0, 0.1)
+    rows = {(row.task, row.other): row for row in against_baselines(load_results(tmp_path))}
+    hits = rows["A", "hits"].test
+    assert hits.difference == pytest.approx(0.15)
+    assert hits.mark == "**"
+    assert hits.p_value is not None
+    assert hits.p_holm == pytest.approx(hits.p_value)  # the larger of two tests
+    assert rows["B", "hits"].test.p_value is None
+    line = tables.comparison_table([rows["B", "hits"]])[1]
+    assert line[-1] == "fewer than three seeds, strongest baseline"
+    assert line[6] == "-"  # one seed against one: no effect size either
+    verdicts = {(c.text, c.task): c.verdict for c in claims(load_results(tmp_path))}
+    best = "ends with a higher success rate than the strongest baseline"
+    assert verdicts[best, "A"] == HOLDS
+    assert verdicts[best, "B"] == f"{SAME} (fewer than three seeds)"
+
+
+def test_ablations_are_compared_with_the_full_model(tmp_path: Path) -> None:
+    for seed in range(3):
+        fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 0.9 + seed / 100)
+        fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 0.4 + seed / 100, variant="no-ts")
+        fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 0.6, variant="something")
+    results = load_results(tmp_path)
+    (row,) = against_ablations(results)
+    assert row.other == "tbc-hrl no-ts"
+    assert row.test.difference == pytest.approx(0.5)
+    (claim,) = [c for c in claims(results) if c.task == "Drawbridge" and "timed subgoals" in c.text]
+    assert claim.verdict == HOLDS
+
+
+def test_few_seeds_pair_the_episodes_that_both_played(tmp_path: Path) -> None:
+    """Both fail in the same episodes, one in a few more: in pairs that is certain, apart it is not."""
+    first, second = "1" * 90 + "0" * 10, "1" * 80 + "0" * 20
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 0.9, outcomes=first)
+    fake_run(tmp_path, "A", "hits", 0, 0.8, outcomes=second)
+    methods = load_results(tmp_path)["A"]
+    interval = difference_of(methods["tbc-hrl"], methods["hits"])
+    assert interval.mean == pytest.approx(0.1)
+    assert interval.low < 0 < interval.high  # never narrower than what both sides say apart
+    assert methods["hits"][0].outcomes == [1] * 80 + [0] * 20
+    assert interval_of(methods["hits"]).low == pytest.approx(0.708, abs=1e-3)
+
+
+def test_unequal_conditions_are_named(tmp_path: Path) -> None:
+    ours = {"env_kwargs": {"observation": "compact"}, "model": {"relative_subgoals": True, "gradient_ratio": 0.25}}
+    theirs = {"env_kwargs": {}, "model": {"gradient_ratio": 0.07}, "n_eval_episodes": 20}
+    for seed in range(2):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, config=ours)
+        fake_run(tmp_path, "A", "hits", seed, 1.0, config=theirs)
+        fake_run(tmp_path, "A", "sac", seed, 1.0, config={**ours, "model": {"gradient_ratio": 0.25}})
+    results = load_results(tmp_path)
+    assert unequal_conditions(results) == {
+        "A": {
+            "hits": [
+                "observation: paper (compact)",
+                "subgoals seen: absolute (relative)",
+                "updates per step: 0.07 (0.25)",
+                "episodes per evaluation: 20 (10)",
+            ]
+        }
+    }
+    assert tables.conditions_table(results)[1][:2] == ["A", "hits"]
+
+
+def test_rows_say_which_seeds_are_from_uncommitted_code(tmp_path: Path) -> None:
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
+    fake_run(tmp_path, "A", "tbc-hrl", 1, 1.0, commit="0123abcd+")
+    fake_run(tmp_path, "A", "tbc-hrl", 2, 1.0, config={"n_envs": 2})
+    methods = load_results(tmp_path)["A"]
+    notes = notes_of_row(methods["tbc-hrl"], methods)
+    assert notes == [
+        "environments: 1 or 2, depending on the seed",
+        "seed 1: code with changes that were not committed",
+    ]
+
+
+def test_no_extreme_is_lost_between_seeds_of_other_steps() -> None:
+    curves = [Curve([10, 20, 30], [0.0, 1.0, 0.0]), Curve([10, 25, 40], [0.5, 0.0, 1.0])]
+    steps, values = on_union_of_steps(curves)
+    assert steps.tolist() == [10, 20, 25, 30]
+    assert values[0].tolist() == [0.0, 1.0, 0.5, 0.0]
+    assert values[1].min() == 0.0
+    with pytest.raises(ValueError, match="curves with points"):
+        on_union_of_steps([Curve([], [])])
+
+
+@pytest.mark.parametrize("rate", ["NaN", "Infinity", '"0.9"', "true", "7", "-3", "null"])
+def test_success_rates_that_are_none(rate: str, tmp_path: Path) -> None:
+    folder = fake_run(tmp_path, "A", "tbc-hrl", 0, 0.5)
+    final = folder.path / "final.json"
+    final.write_text(final.read_text().replace('"success_rate": 0.5', f'"success_rate": {rate}'))
+    with pytest.raises(ConfigError, match="seed_0"):
+        load_results(tmp_path)
+
+
+def test_the_shipped_figures_are_the_papers() -> None:
+    tables_of_paper = yaml.safe_load((ROOT / "tests" / "data" / "paper_tables.yaml").read_text())
+    paper = load_paper()
+    for task, row in tables_of_paper["table_2_success_percent"].items():
+        for algo in ("sac", "hac", "hits", "tbc_hrl"):
+            found = paper.success(task, algo.replace("_", "-"))
+            assert found is not None
+            assert found == pytest.approx([x / 100 for x in row[algo]])
+    for task, row in tables_of_paper["table_3_ablation_percent"].items():
+        for name, variant in (("no_ndbcnet", "no-ndbc"), ("no_ts", "no-ts")):
+            assert paper.success(task, f"tbc-hrl {variant}") == pytest.approx([x / 100 for x in row[name]])
+    steps = {t: row["training_steps"] for t, row in tables_of_paper["table_1_environments"].items()}
+    assert paper.steps == steps
+    assert paper.success("Pendulum", "tbc-hrl searched") is None
+
+
+def test_every_committed_row_has_a_description() -> None:
+    results, descriptions = load_results(ROOT / "results"), load_descriptions(ROOT / "results")
+    missing = [(t, m) for t, methods in results.items() for m in methods if not describe(descriptions, t, m)]
+    assert missing == []
+    assert describe(descriptions, "Nowhere", "tbc-hrl no-ts").startswith("ablation")
+    assert describe(descriptions, "Nowhere", "tbc-hrl unheard-of") == ""
