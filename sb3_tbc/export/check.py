@@ -21,6 +21,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import Circuit, ExportedPolicy
 from sb3_tbc.extras import require
 from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.zoo.environments import make_env
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
 CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=c99")
@@ -225,7 +226,7 @@ def check(
     :param seed: of the first episode
     :return: what to print: the comparison, how well a circuit's closed form does, and the time of a step in C
     """
-    env = gym.make(info["env_id"], **(info.get("env_kwargs") or {}))
+    env = make_env(info["env_id"], **(info.get("env_kwargs") or {}))
     exported = player(kind, path, policy)
     try:
         lines = [str(compare(model, exported, env, steps, seed))]

@@ -25,7 +25,8 @@ def goal_space_problems(observation: spaces.Space[Any], action: spaces.Space[Any
     for key in GOAL_KEYS:
         part = observation.spaces[key]
         if not isinstance(part, spaces.Box) or len(part.shape) != 1:
-            found.append(f"its observation[{key!r}] must be a Box with one dimension, got {part}; flatten it")
+            got = part if isinstance(part, spaces.Box) else type(part).__name__
+            found.append(f"its observation[{key!r}] must be a Box with one dimension, got {got}; flatten it")
     achieved, desired = observation["achieved_goal"].shape, observation["desired_goal"].shape
     if achieved != desired:
         found.append(f"its achieved_goal {achieved} and desired_goal {desired} must have one shape")

@@ -28,6 +28,8 @@ class SubgoalSpace:
     :param names: a name for each coordinate
     :param groups: coordinate groups whose Euclidean distance is compared with a threshold; by default each
         coordinate is a group of its own
+    :param rotations: which of ``groups`` are unit quaternions: their distance is the angle between the rotations [rad],
+        so that a quaternion and its negative are the same
     :param event: index into the task's ``observation`` of a flag that is 1 in just the step of a decisive event, at
         which control returns to the high level and which gives the goal of hindsight where ``goal_strategy`` is
         ``"event"``; None where the task has no such event
@@ -35,6 +37,7 @@ class SubgoalSpace:
     """
 
     event: int | None = None  # also of spaces in agents that were saved before there were events
+    rotations: tuple[int, ...] = ()  # likewise
 
     def __init__(
         self,
@@ -47,6 +50,7 @@ class SubgoalSpace:
         names: Sequence[str],
         groups: Sequence[Sequence[int]] | None = None,
         event: int | None = None,
+        rotations: Sequence[int] = (),
     ) -> None:
         self.low = np.asarray(low, dtype=np.float64)
         self.high = np.asarray(high, dtype=np.float64)
@@ -59,6 +63,7 @@ class SubgoalSpace:
         self._achieved = achieved
         self._local = local
         self.event = event
+        self.rotations = tuple(rotations)
         self._check()
 
     def _check(self) -> None:
@@ -76,6 +81,9 @@ class SubgoalSpace:
             )
         if sorted(i for g in self.groups for i in g) != list(range(self.dim)):
             raise ValueError(f"groups must use each of the {self.dim} coordinates once, got {self.groups}")
+        for index in self.rotations:
+            if not 0 <= index < len(self.groups) or len(self.groups[index]) != 4:
+                raise ValueError(f"rotations must name groups of four coordinates of {self.groups}, got {index}")
 
     @property
     def dim(self) -> int:
@@ -118,8 +126,11 @@ class SubgoalSpace:
         if len(self.groups) == self.dim:
             near = np.abs(difference, out=difference) < self.thresholds
             return np.asarray(np.logical_and.reduce(near, axis=-1))  # all(), without its detour through Python
-        distances = np.stack([np.linalg.norm(difference[..., list(g)], axis=-1) for g in self.groups], axis=-1)
-        return np.asarray((distances < self.thresholds).all(axis=-1))
+        distances = [np.linalg.norm(difference[..., list(g)], axis=-1) for g in self.groups]
+        for index in self.rotations:
+            group = list(self.groups[index])
+            distances[index] = angle_between(achieved[..., group], subgoal[..., group])
+        return np.asarray((np.stack(distances, axis=-1) < self.thresholds).all(axis=-1))
 
     def happened(self, observation: GoalObservation) -> NDArray[np.bool_]:
         """Whether the decisive event happened in the step that led to ``observation``, ``(...)``; never without one."""
@@ -134,3 +145,10 @@ class SubgoalSpace:
     def unscale(self, unit: FloatArray) -> FloatArray:
         """From [-1, 1] coordinates to task units."""
         return np.asarray(self.low + 0.5 * (unit + 1.0) * (self.high - self.low))
+
+
+def angle_between(one: FloatArray, other: FloatArray) -> FloatArray:
+    """Angle [rad] between the rotations of two quaternions ``(..., 4)`` of any length, ``(...)``."""
+    lengths = np.linalg.norm(one, axis=-1) * np.linalg.norm(other, axis=-1)
+    cosine = np.abs((one * other).sum(axis=-1)) / np.maximum(lengths, 1e-12)
+    return np.asarray(2.0 * np.arccos(np.minimum(cosine, 1.0)))

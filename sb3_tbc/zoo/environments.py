@@ -17,9 +17,18 @@ import sb3_tbc  # noqa: F401  (registers the tasks)
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly
-from sb3_tbc.tasks.generic import DescribedGoalEnv
+from sb3_tbc.tasks.generic import DescribedGoalEnv, GoalEnvDescription
 
 NAMESPACE = "sb3_tbc/"
+OTHER_PACKAGES = {  # how ids begin: module that registers them, name of its distribution
+    **dict.fromkeys(
+        ("Fetch", "PointMaze", "AntMaze", "Adroit", "Hand", "FrankaKitchen"), (ROBOTICS, "gymnasium-robotics")
+    ),
+    "Panda": ("panda_gym", "panda-gym"),
+    "parking": ("highway_env", "highway-env"),
+}
+_DESCRIPTIONS: dict[str, GoalEnvDescription] = {}
+"""Descriptions by id and arguments: environments made alike need the random episodes only once."""
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
@@ -69,12 +78,15 @@ def _import(module: str, name: str) -> None:
 
 
 def _hint(env_id: str) -> str:
-    """What to install for an id that looks like one of Gymnasium-Robotics."""
-    if any(i.startswith(("Fetch", "PointMaze", "AntMaze")) for i in gym.registry) or not env_id.startswith(
-        ("Fetch", "PointMaze", "AntMaze", "Adroit", "Hand", "FrankaKitchen")
-    ):
+    """What to install or to write for an id that looks like one of a known package."""
+    found = [place for start, place in OTHER_PACKAGES.items() if env_id.startswith(start)]
+    if not found:
         return ""
-    return f"; it is one of {ROBOTICS}'s: pip install gymnasium-robotics"
+    module, distribution = found[0]
+    if module == ROBOTICS:
+        installed = any(i.startswith(("Fetch", "PointMaze", "AntMaze")) for i in gym.registry)
+        return "" if installed else f"; it is one of {module}'s: pip install {distribution}"
+    return f"; ids of {distribution} are written with its module, {module}:{env_id} (pip install {distribution})"
 
 
 def _known(name: str, tasks: Mapping[str, str]) -> list[str]:
@@ -93,9 +105,6 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[st
     :raises ConfigError: if it cannot be made, is no goal environment, its actions are not a Box, or it is told about
         subgoals although it brings its own
     """
-    module = env_id.rpartition(":")[0]
-    if module:
-        _import(module, env_id)
     try:
         kwargs = dict(env_kwargs or {})
         env = make_vec_env(partial(make_env, env_id), n_envs, seed=seed, env_kwargs=kwargs, vec_env_cls=GoalVecEnv)
@@ -124,11 +133,17 @@ def _cause(error: Exception) -> str:
 def make_env(env_id: str, subgoals: Mapping[str, Any] | None = None, **env_kwargs: Any) -> gym.Env[Any, Any]:
     """Make one environment, able to draw itself where it can; a foreign goal environment gets a derived subgoal space.
 
-    :param env_id: as registered
+    Everything that needs an environment for an id makes it here: training, evaluation, films, the check of exports.
+
+    :param env_id: as registered, with its module where it has one
     :param subgoals: for :class:`~sb3_tbc.tasks.generic.DescribedGoalEnv`
     :param env_kwargs: for ``gymnasium.make``
-    :raises ConfigError: if it is told about subgoals although it brings its own
+    :raises ConfigError: if its module cannot be imported, or it is told about subgoals although it brings its own
     """
+    module = env_id.rpartition(":")[0]
+    if module:
+        _import(module, env_id)
+    env: gym.Env[Any, Any]
     try:
         env = gym.make(env_id, **{"render_mode": "rgb_array", **env_kwargs})
     except TypeError:
@@ -139,7 +154,12 @@ def make_env(env_id: str, subgoals: Mapping[str, Any] | None = None, **env_kwarg
         return env
     keys = env.observation_space.spaces if isinstance(env.observation_space, spaces.Dict) else {}
     is_goal_env = all(key in keys for key in GOAL_KEYS) and isinstance(env.action_space, spaces.Box)
-    return DescribedGoalEnv(env, **(subgoals or {})) if is_goal_env else env
+    if not is_goal_env:
+        return env
+    made_alike = repr((env.spec, sorted(env_kwargs.items()), sorted((subgoals or {}).items())))
+    env = described = DescribedGoalEnv(env, description=_DESCRIPTIONS.get(made_alike), **(subgoals or {}))
+    _DESCRIPTIONS[made_alike] = described.description
+    return env
 
 
 def check_goal_env(env: VecEnv, env_id: str) -> None:

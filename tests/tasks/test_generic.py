@@ -15,6 +15,8 @@ from sb3_tbc.tasks.generic import DescribedGoalEnv, check_goal_env, describe_goa
 class Point(gym.Env):
     """A point in the plane; the observation holds position and velocity."""
 
+    extra = {}  # noqa: RUF012 (what info holds)
+
     def __init__(self, bound=np.inf, hidden=False, threshold=None):
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         goal = spaces.Box(-bound, bound, (2,), np.float64)
@@ -47,8 +49,8 @@ class Point(gym.Env):
         self.position = self.position + self.velocity
         self.steps += 1
         observation = self._see()
-        reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], {})
-        return observation, float(reward), False, self.steps >= 30, {}
+        reward = self.compute_reward(observation["achieved_goal"], observation["desired_goal"], self.extra)
+        return observation, float(reward), False, self.steps >= 30, dict(self.extra)
 
     def compute_reward(self, achieved_goal, desired_goal, info):
         return np.where(np.linalg.norm(achieved_goal - desired_goal, axis=-1) < 0.3, 0.0, -1.0)
@@ -95,10 +97,12 @@ def test_check_finds_rewards_that_cannot_be_recomputed():
         check_goal_env(Liar())
 
 
-def test_bounds_come_from_box_or_from_random_episodes():
-    finite = describe_goal_env(Point(bound=3.0)).subgoals
-    np.testing.assert_array_equal(finite.low, [-3, -3])
-    np.testing.assert_allclose(finite.thresholds, 0.3)
+def test_bounds_come_from_random_episodes_within_the_declared_box():
+    tight = describe_goal_env(Point(bound=1.5)).subgoals  # goals up to 2 are asked for
+    np.testing.assert_array_equal(tight.low, [-1.5, -1.5])
+    np.testing.assert_allclose(tight.thresholds, 0.3)
+    wide = describe_goal_env(Point(bound=100.0)).subgoals  # nothing is ever seen beyond 4
+    assert (np.abs([wide.low, wide.high]) < 4.0).all()
     sampled = describe_goal_env(Point()).subgoals
     assert (sampled.low < -1.8).all()
     assert (sampled.high > 1.8).all()
@@ -115,13 +119,14 @@ def test_bounds_come_from_box_or_from_random_episodes():
         describe_goal_env(Point(), low=[2, 2], high=[1, 1])
 
 
-def test_distance_threshold_is_euclidean():
+def test_thresholds_come_from_the_reward_whatever_is_declared():
     subgoals = describe_goal_env(Point(threshold=0.5)).subgoals
     assert subgoals.groups == ((0, 1),)
-    assert subgoals.reached(np.array([0.3, 0.3]), np.zeros(2))
-    assert not subgoals.reached(np.array([0.4, 0.4]), np.zeros(2))
+    assert subgoals.reached(np.array([0.2, 0.2]), np.zeros(2))
+    assert not subgoals.reached(np.array([0.3, 0.1]), np.zeros(2))
     one = describe_goal_env(Point(), thresholds=0.2).subgoals
     assert one.groups == ((0, 1),)
+    np.testing.assert_array_equal(one.thresholds, [0.2])
 
 
 class Boxed(Point):
@@ -148,10 +153,233 @@ def test_thresholds_come_from_rewards_where_nothing_is_declared():
     same = Boxed(bound=4.0)
     same.slack = 0.3
     assert describe_goal_env(same).subgoals.groups == ((0,), (1,))
-    blind = Boxed(bound=4.0)
-    blind.slack = np.inf
-    for env in (blind, Dense(bound=4.0)):  # rewards that do not tell: 5 % of each range
-        np.testing.assert_allclose(describe_goal_env(env).subgoals.thresholds, [0.4, 0.4])
+
+
+def test_a_coordinate_that_the_reward_ignores_leaves_the_others_alone():
+    env = Boxed(bound=4.0)
+    env.slack = np.inf
+    subgoals = describe_goal_env(env).subgoals
+    assert subgoals.thresholds[0] == 0.3
+    assert subgoals.thresholds[1] > (subgoals.high - subgoals.low)[1]  # any subgoal is reached in it
+
+
+def test_a_coordinate_that_must_match_exactly_gets_a_share_of_its_range():
+    env = Boxed(bound=4.0)
+    env.slack = 1e-300
+    subgoals = describe_goal_env(env, low=[-2, -2], high=[2, 2]).subgoals
+    np.testing.assert_allclose(subgoals.thresholds, [0.3, 0.2])
+
+
+class DenseWithTest(Dense):
+    def _is_success(self, achieved_goal, desired_goal):
+        return np.linalg.norm(achieved_goal - desired_goal, axis=-1) < 0.3
+
+
+class DenseWithSingleTest(Dense):
+    def _is_success(self, achieved_goal, desired_goal):
+        return bool(np.linalg.norm(achieved_goal - desired_goal) < 0.3)
+
+
+@pytest.mark.parametrize("kind", [DenseWithTest, DenseWithSingleTest])
+def test_a_dense_reward_needs_the_tasks_success_test(kind):
+    env = DescribedGoalEnv(kind())
+    np.testing.assert_array_equal(env.subgoals.thresholds, [0.3])
+    env.reset(seed=0)
+    goals = np.zeros((2, 2)), np.array([[0.2, 0.0], [0.4, 0.0]])
+    np.testing.assert_array_equal(env.compute_terminated(*goals), [True, False])
+    np.testing.assert_allclose(env.compute_reward(*goals), [-0.2, -0.4])
+    env.unwrapped.goal = env.unwrapped.position + 0.05
+    _, reward, terminated, _, info = env.step(np.zeros(2))
+    assert (terminated, info["is_success"]) == (True, True)
+    assert -0.1 < reward < 0.0
+
+
+def test_a_dense_reward_without_a_test_is_refused_or_takes_given_thresholds():
+    with pytest.raises(ValueError, match=r"Dense cannot be used .* its reward is dense.*thresholds") as caught:
+        describe_goal_env(Dense())
+    assert "\n" not in str(caught.value)
+    env = DescribedGoalEnv(Dense(), thresholds=0.25)
+    assert env.compute_terminated(np.zeros(2), np.array([0.2, 0.0])) is True
+    assert env.compute_terminated(np.zeros(2), np.array([0.3, 0.0])) is False
+
+
+class Pose(Point):
+    """Position and orientation; both count, and the reward knows no distance between other points than poses."""
+
+    turn, ignored = 0.2, False
+
+    def __init__(self):
+        super().__init__()
+        goal = spaces.Box(-np.inf, np.inf, (6,), np.float64)
+        self.observation_space = spaces.Dict(observation=goal, achieved_goal=goal, desired_goal=goal)
+
+    def _see(self):
+        angle = self.position.sum()
+        pose = np.concatenate([self.position, [np.cos(angle), np.sin(angle), 0, 0]])
+        return {"observation": pose, "achieved_goal": pose.copy(), "desired_goal": self.pose.copy()}
+
+    def reset(self, *, seed=None, options=None):
+        self.pose = np.zeros(6)
+        super().reset(seed=seed)
+        quaternion = self.np_random.normal(size=4)
+        self.pose = np.concatenate([self.goal, quaternion / np.linalg.norm(quaternion)])
+        return self._see(), {}
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        one, other = np.asarray(achieved_goal), np.asarray(desired_goal)
+        near = np.linalg.norm(one[..., :2] - other[..., :2], axis=-1) < 0.3
+        assert np.allclose(np.linalg.norm(one[..., 2:], axis=-1), 1.0), "asked at a point that is no pose"
+        angle = 2 * np.arccos(np.minimum(np.abs((one[..., 2:] * other[..., 2:]).sum(-1)), 1.0))
+        return np.where(near & ((angle < self.turn) | self.ignored), 0.0, -1.0)
+
+
+def test_quaternions_are_compared_by_angle_and_asked_about_only_where_they_are_rotations():
+    subgoals = describe_goal_env(Pose()).subgoals
+    assert subgoals.groups == ((0, 1), (2, 3, 4, 5))
+    assert subgoals.rotations == (1,)
+    np.testing.assert_allclose(subgoals.thresholds, [0.3, 0.2], rtol=1e-4)
+    pose = np.array([0.1, 0.2, 0.5, 0.5, 0.5, 0.5])
+    negative = pose * [1, 1, -1, -1, -1, -1]
+    assert subgoals.reached(pose, pose)
+    assert subgoals.reached(negative, pose)
+    assert subgoals.reached(pose, pose * [1, 1, 3, 3, 3, 3])  # a subgoal's length means nothing
+    for angle, near in ((0.19, True), (0.21, False)):
+        turned = np.append(
+            pose[:2], np.cos(angle / 2) * pose[2:] + np.sin(angle / 2) * np.array([0.5, -0.5, 0.5, -0.5])
+        )
+        assert bool(subgoals.reached(turned, pose)) is near
+        assert bool(subgoals.reached(turned[None], pose[None])[0]) is near
+    free = Pose()
+    free.ignored = True
+    assert describe_goal_env(free).subgoals.thresholds[1] > np.pi
+
+
+def test_rewards_that_contradict_themselves_are_refused():
+    class Uneven(Point):
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return super().compute_reward(achieved_goal, desired_goal, info) * np.asarray(desired_goal)[..., 0] + 0.0
+
+    class Better(Point):
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return -super().compute_reward(achieved_goal, desired_goal, info)
+
+    class Always(Point):
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return np.zeros(np.shape(achieved_goal)[:-1])
+
+    class Claims(Point):
+        def step(self, action):
+            *rest, info = super().step(action)
+            return *rest, {**info, "success": True}
+
+    class Raised(Point):
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            base = super().compute_reward(achieved_goal, desired_goal, info)
+            return base + np.abs(np.asarray(desired_goal)[..., 0])
+
+    for kind, message in (
+        (Better, "away from a goal, but only"),
+        (Always, "for every observed pair of goals"),
+        (Claims, "its info says otherwise than its reward"),
+        (Raised, "not the same everywhere"),
+    ):
+        with pytest.raises(ValueError, match=f"{kind.__name__} cannot be used .*{message}"):
+            describe_goal_env(kind())
+
+
+def test_the_check_asks_as_training_does():
+    class Costly(Point):
+        extra = {"cost": 1.0}  # noqa: RUF012
+
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return super().compute_reward(achieved_goal, desired_goal, info) - info["cost"]
+
+    class Hidden(Costly):
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return Point.compute_reward(self, achieved_goal, desired_goal, info) - info.get("cost", 0.0)
+
+    with pytest.raises(ValueError, match=r"fails \(KeyError: 'cost'\)"):
+        check_goal_env(Costly())
+    with pytest.raises(ValueError, match="must not depend on info or on wrappers"):
+        check_goal_env(Hidden())
+    with pytest.raises(ValueError, match="must not depend on info or on wrappers"):
+        check_goal_env(gym.wrappers.TransformReward(Point(), lambda reward: 2 * reward))
+
+
+def test_a_crash_may_cost_more_than_the_goal_says():
+    class Crashing(Point):
+        def step(self, action):
+            observation, reward, *_ = super().step(action)
+            return observation, reward - 5.0 * (self.steps == 3), self.steps == 3, False, {}
+
+    check_goal_env(Crashing())
+
+
+def test_arrays_that_are_used_again_are_copied():
+    class Same(Point):
+        def _see(self):
+            fresh = super()._see()
+            if not hasattr(self, "held"):
+                self.held = fresh
+            for key, value in fresh.items():
+                self.held[key][:] = value
+            return self.held
+
+    one, other = describe_goal_env(Same()), describe_goal_env(Point())
+    np.testing.assert_array_equal(one.subgoals.low, other.subgoals.low)
+    np.testing.assert_array_equal(one.observation_scale, other.observation_scale)
+
+
+def test_randomness_from_elsewhere_is_noticed():
+    class Loose(Point):
+        def step(self, action):
+            return super().step(np.asarray(action) * np.random.default_rng().uniform(0.5, 1.0))
+
+    with pytest.warns(UserWarning, match=r"Loose differs between two episodes.*self\.np_random"):
+        check_goal_env(Loose())
+
+
+def test_probing_leaves_the_random_stream_alone():
+    one, other = Point(), Point()
+    one.reset(seed=7)
+    other.reset(seed=7)
+    describe_goal_env(one)
+    np.testing.assert_array_equal(one.reset()[0]["desired_goal"], other.reset()[0]["desired_goal"])
+
+
+def test_user_wrappers_and_changed_attributes_count():
+    class Half(gym.ObservationWrapper):
+        """Shows goals at half their size; records no constructor arguments, so no copy of it can be made."""
+
+        def observation(self, observation):
+            return {**observation, **{key: 0.5 * observation[key] for key in ("achieved_goal", "desired_goal")}}
+
+        def compute_reward(self, achieved_goal, desired_goal, info):
+            return self.unwrapped.compute_reward(2 * achieved_goal, 2 * desired_goal, info)
+
+    plain, half = DescribedGoalEnv(Point()), DescribedGoalEnv(Half(Point()))
+    np.testing.assert_allclose(half.subgoals.high, 0.5 * plain.subgoals.high)
+    np.testing.assert_allclose(half.subgoals.thresholds, [0.15])
+    env = Boxed()
+    env.slack = 0.7
+    np.testing.assert_allclose(DescribedGoalEnv(env).subgoals.thresholds, [0.3, 0.7])
+
+
+def test_success_is_read_under_either_name():
+    class Says(Point):
+        name = "success"
+
+        def step(self, action):
+            observation, reward, *rest, _ = super().step(action)
+            return observation, reward, *rest, {self.name: reward == 0.0}
+
+    for name in ("success", "is_success"):
+        env = DescribedGoalEnv(Says())
+        env.unwrapped.name = name
+        env.reset(seed=0)
+        assert env.step(np.zeros(2))[4]["is_success"] is False
+        env.unwrapped.goal = env.unwrapped.position.copy()
+        assert env.step(np.zeros(2))[4]["is_success"] is True
 
 
 def test_low_level_sees_the_achieved_goal():
@@ -194,20 +422,12 @@ def test_wrapper_brings_rewards_to_zero_and_minus_one():
     assert not DescribedGoalEnv(Paying(), terminate_on_success=False).compute_terminated(*goals, {}).any()
 
 
-def test_description_is_found_once_per_environment_and_arguments(monkeypatch):
-    from sb3_tbc.tasks import generic
-
-    calls = []
-    describe = generic.describe_goal_env
-    monkeypatch.setattr(
-        generic, "describe_goal_env", lambda env, **given: calls.append(given) or describe(env, **given)
-    )
-    for low in (-3, -3, -2):
-        DescribedGoalEnv(make("Pendulum"), n_probe_steps=5, low=[low, -9])
-    assert [given["low"] for given in calls] == [[-3, -9], [-2, -9]]
-    DescribedGoalEnv(Point(), n_probe_steps=5)
-    DescribedGoalEnv(Point(), n_probe_steps=5)
-    assert len(calls) == 4  # without a spec there is nothing to tell environments apart by
+def test_a_description_can_be_shared_and_travels():
+    first = DescribedGoalEnv(Point())
+    again = DescribedGoalEnv(Point(), description=pickle.loads(pickle.dumps(first.description)))
+    np.testing.assert_array_equal(again.subgoals.low, first.subgoals.low)
+    again.reset(seed=0)
+    assert again.compute_terminated(np.zeros(2), np.zeros(2)) is True
 
 
 def test_a_maze_of_gymnasium_robotics():

@@ -43,6 +43,8 @@ def test_ids_of_gymnasium_robotics_need_no_module() -> None:
     [
         ("PointMaze_UMase-v3", "did you mean 'PointMaze_UMaze-v3'"),
         ("Pendulun", "did you mean 'Pendulum'"),
+        ("PandaReach-v3", "panda_gym:PandaReach-v3"),
+        ("parking-v0", "highway_env:parking-v0"),
         ("no_such_module:Env-v0", "cannot import module 'no_such_module'"),
     ],
 )
@@ -80,6 +82,29 @@ def test_subgoals_of_the_configuration_reach_the_environment() -> None:
     np.testing.assert_array_equal(subgoals.high, [1, 2])
     np.testing.assert_array_equal(subgoals.thresholds, [0.3])
     assert (subgoals.groups, subgoals.names) == (((0, 1),), ("x", "y"))
+
+
+def test_random_episodes_run_once_for_environments_made_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    from sb3_tbc.tasks import generic
+
+    asked = []
+    probe = generic.run_probe
+    monkeypatch.setattr(generic, "run_probe", lambda *args: asked.append(args[1:]) or probe(*args))
+    given = {"n_probe_steps": 31}
+    make_envs(MAZE, 3, 0, {"subgoals": given}).close()
+    make_envs(MAZE, 2, 9, {"subgoals": given}).close()
+    assert len(asked) == 1
+    make_envs(MAZE, 1, 0, {"subgoals": given, "max_episode_steps": 77}).close()
+    make_envs(MAZE, 1, 0, {"subgoals": {**given, "low": [-9.0, -9.0]}}).close()
+    assert len(asked) == 3
+
+
+def test_a_missing_time_limit_is_cured_from_the_command_line() -> None:
+    override = parse_overrides(["env_kwargs.max_episode_steps:40"])
+    with pytest.raises(ConfigError, match=r"no time limit.*--hyperparams env_kwargs.max_episode_steps:N"):
+        make_envs(MAZE, 1, 0, {"max_episode_steps": -1})
+    env = make_envs(MAZE, 1, 0, load_config("tbc-hrl", "PointMaze_UMaze-v3", overrides=override).env_kwargs)
+    assert env.get_attr("max_episode_steps") == [40]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,89 @@
+"""Random episodes in a goal environment: what it shows and pays, before anything is believed of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+
+Floats = NDArray[np.float64]
+
+
+class Probe(NamedTuple):
+    """What random episodes showed; ``n`` observations, the first of each episode included, and ``m`` steps."""
+
+    seen: dict[str, Floats]  # (n, dim) for each of GOAL_KEYS
+    after: NDArray[np.intp]  # (m,) index into ``seen`` of what each step led to
+    rewards: Floats  # (m,)
+    terminated: NDArray[np.bool_]  # (m,)
+    successes: list[bool | None]  # (m,) what ``info`` says; None where it does not say
+
+    @property
+    def achieved(self) -> Floats:
+        """Achieved goals after the steps, ``(m, goal_dim)``."""
+        return self.seen["achieved_goal"][self.after]
+
+    @property
+    def desired(self) -> Floats:
+        """Desired goals after the steps, ``(m, goal_dim)``."""
+        return self.seen["desired_goal"][self.after]
+
+
+def run_probe(env: gym.Env[Any, Any], n_steps: int, seed: int = 0, episode_steps: int = 50) -> Probe:
+    """Run random actions, each held for five steps, in short episodes.
+
+    The environment's own random stream is put back afterwards. The last episode is left unfinished, so that the
+    environment has to be reset before it is used.
+
+    :param env: a goal environment; arrays are copied, because some environments hand out the same ones every step
+    :param n_steps: steps together
+    :param seed: of the first reset and of the actions
+    :param episode_steps: longest episode
+    """
+    rng, actions = np.random.default_rng(seed), env.action_space
+    assert isinstance(actions, spaces.Box)
+    with _random_stream_kept(env):
+        seen = [_copied(env.reset(seed=seed)[0])]
+        after, rewards, terminations, successes = [], [], [], []
+        action, ended = actions.low, False
+        for step in range(n_steps):
+            if ended or step % episode_steps == episode_steps - 1:
+                seen.append(_copied(env.reset()[0]))
+            if step % 5 == 0:
+                action = rng.uniform(actions.low, actions.high).astype(actions.dtype)
+            observation, reward, terminated, truncated, info = env.step(action)
+            after.append(len(seen))
+            seen.append(_copied(observation))
+            rewards.append(float(reward))
+            terminations.append(bool(terminated))
+            successes.append(said_success(info))
+            ended = terminated or truncated
+    stacked = {key: np.stack([observation[key] for observation in seen]) for key in GOAL_KEYS}
+    return Probe(stacked, np.array(after), np.array(rewards), np.array(terminations), successes)
+
+
+def said_success(info: dict[str, Any]) -> bool | None:
+    """Success of a step as its ``info`` says it, under ``is_success`` or ``success``; None where it says nothing."""
+    said = info.get("is_success", info.get("success"))
+    return None if said is None else bool(np.all(said))
+
+
+def _copied(observation: Any) -> dict[str, Floats]:
+    return {key: np.array(observation[key], dtype=np.float64) for key in GOAL_KEYS}
+
+
+@contextmanager
+def _random_stream_kept(env: gym.Env[Any, Any]) -> Iterator[None]:
+    inner = env.unwrapped
+    generator, seed = inner._np_random, inner._np_random_seed
+    try:
+        yield
+    finally:
+        inner._np_random, inner._np_random_seed = generator, seed
