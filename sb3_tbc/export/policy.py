@@ -170,6 +170,8 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     sizes = {f"n_{key}": _width(model, name) for key, name in GOAL_PARTS.items()}
     probe = _Probe(sizes["n_observation"], sizes["n_achieved"])
     needed = rules.window_end == "reached" or layout.relative_subgoals
+    if subgoals.rotations and rules.window_end == "reached":
+        raise ConfigError("window_end='reached' with subgoals that are compared by angle cannot be exported")
     high, low = model.high.policy.average_actor, model.low.policy.average_actor
     if isinstance(high, NDBCActor):
         raise ConfigError("only the low level can be a circuit")
@@ -284,9 +286,10 @@ class _Probe:
         self.split, self.n = n_observation, n_observation + n_achieved
         self.rng = np.random.default_rng(0)
 
-    def _ask(self, function: Callable[[Any], FloatArray], entries: FloatArray) -> FloatArray:
+    def _ask(self, function: Callable[[Any], FloatArray], entries: FloatArray, desired: float = 0.0) -> FloatArray:
         observation, achieved = entries[..., : self.split], entries[..., self.split :]
-        answer = function({"observation": observation, "achieved_goal": achieved, "desired_goal": achieved})
+        goal = np.full_like(achieved, desired)
+        answer = function({"observation": observation, "achieved_goal": achieved, "desired_goal": goal})
         return np.asarray(answer, dtype=np.float64)
 
     def selection(self, function: Callable[[Any], FloatArray]) -> tuple[int, ...]:
@@ -307,6 +310,11 @@ class _Probe:
         """
         base = self.rng.normal(size=(8, self.n))
         values = self._ask(function, base)
+        if not np.array_equal(values, self._ask(function, base, desired=np.pi), equal_nan=True):
+            raise ConfigError(
+                "the task's SubgoalSpace computes the local state or the subgoal from desired_goal, which the low "
+                "level of an exported policy does not see: cannot export"
+            )
         depends = np.zeros((values.shape[1], self.n), dtype=bool)
         for entry in range(self.n):
             moved = base.copy()

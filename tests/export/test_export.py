@@ -288,6 +288,8 @@ def test_an_unknown_subgoal_formula_is_refused() -> None:
         probe.coordinates(lambda o: o["observation"][..., 1:2] ** 2)
     with pytest.raises(ConfigError, match="entry 0 of the local state"):
         probe.selection(lambda o: np.clip(o["observation"][..., 1:2], -1, 1))
+    with pytest.raises(ConfigError, match="from desired_goal"):
+        probe.selection(lambda o: np.concatenate([o["observation"], o["desired_goal"][..., :1]], axis=-1))
 
 
 def test_an_agent_with_windows_from_another_network_is_refused() -> None:
