@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -13,7 +14,9 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.errors import HierarchyError
+from sb3_tbc.smdp.episode_limit import ANNOUNCE, BUDGET_EXHAUSTED, LastWindow, can_tell, with_episode_limit
 from sb3_tbc.smdp.faults import step_or_name
+from sb3_tbc.smdp.finite import all_finite, refusal
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, width
 from sb3_tbc.smdp.options import Episode, OptionClock, OptionRules, TerminationReason
 from sb3_tbc.smdp.recorder import EpisodeRecorder
@@ -75,6 +78,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         schedule: Schedule | None = None,
     ) -> None:
         space = check_goal_space(venv.observation_space, venv.action_space)
+        venv = with_episode_limit(venv)
         super().__init__(venv, observation_space=layout.low_space(), action_space=venv.action_space)
         self.high_level, self.views, self.rules, self.schedule = high_level, layout, rules, schedule
         self.clock = OptionClock(venv.num_envs, layout.subgoals, rules)
@@ -82,6 +86,8 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self._everywhere = np.arange(venv.num_envs)
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
         self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
+        ends_early = rules.ends_when_reached or layout.subgoals.event is not None
+        self._task_can_tell = ends_early and can_tell(venv, layout.subgoals)
         self._started = False
         self._given: NDArray[Any] = np.zeros(0)  # what step_async was given
 
@@ -104,6 +110,8 @@ class HierarchicalVecEnv(VecEnvWrapper):
         :param observation: what the environments show
         :return: what the low level sees
         """
+        self._recorder.steps[:] = 0
+        self._refuse_bad(observation)
         self._begin_episodes(self._everywhere, observation)
         self._begin_options(self._everywhere, observation)
         self._started = True
@@ -125,6 +133,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         for (owner, _, name), array in parts.items():
             if owner == "clock":
                 getattr(self.clock, name)[:] = array
+        self._announce(self._everywhere)
         self._started = True
         return self._low_observation(observation)
 
@@ -169,9 +178,10 @@ class HierarchicalVecEnv(VecEnvWrapper):
         )
         observation, task_rewards, dones, infos = step_or_name(self.venv, actions, self._recorder.steps)
         seen = self._before_reset(observation, dones, infos)  # type: ignore[arg-type]
+        self._refuse_bad(seen, task_rewards)
         self._recorder.after_step(task_rewards, seen)
         self.clock.tick()
-        over = self.clock.ended(seen) | dones
+        over = self._windows_over(seen, dones)
         rewards, episodes = np.zeros(self.num_envs, dtype=np.float32), {}
         if np.count_nonzero(over):  # several times as fast as any() on so few
             where = np.flatnonzero(over)
@@ -182,6 +192,30 @@ class HierarchicalVecEnv(VecEnvWrapper):
                 _tell_low_level(where, last, infos)
         low = self._low_observation(observation)  # type: ignore[arg-type]
         return HierarchicalStep(low, over, observation, task_rewards, dones, infos, rewards, episodes)  # type: ignore[arg-type]
+
+    def _refuse_bad(self, seen: GoalObservation, rewards: FloatArray | None = None) -> None:
+        """Let nothing in that is not finite.
+
+        :raises NonFiniteError: naming environment, step and key
+        """
+        parts = [seen[key] for key in GOAL_KEYS]
+        if not all_finite(*parts if rewards is None else (*parts, rewards)):
+            steps = self._recorder.steps if rewards is None else self._recorder.steps + 1
+            raise refusal(seen, steps, rewards)
+
+    def _windows_over(self, seen: GoalObservation, dones: BoolArray) -> BoolArray:
+        """Whose window ends with this step.
+
+        The last window of an episode ends when the task says that the episode does. It was told when that is to be;
+        where wrappers change what it sees, it may be a step late, which the window then lasts longer.
+        """
+        over = self.clock.ended(seen) | dones
+        late = over & ~dones & (self.clock.used >= self.rules.max_options)
+        if np.count_nonzero(late):
+            for index in np.flatnonzero(late):
+                self.venv.env_method(ANNOUNCE, LastWindow(1), indices=[int(index)])
+            over &= ~late
+        return over
 
     def _before_reset(
         self, observation: GoalObservation, dones: BoolArray, infos: list[dict[str, Any]]
@@ -211,31 +245,21 @@ class HierarchicalVecEnv(VecEnvWrapper):
         return rewards
 
     def _next_options(
-        self, where: Indices, observation: dict[str, FloatArray], dones: BoolArray, infos: list[dict[str, Any]]
+        self, where: Indices, observation: GoalObservation, dones: BoolArray, infos: list[dict[str, Any]]
     ) -> dict[int, Episode]:
-        """Finish episodes and begin options; enforced resets change ``observation`` in place."""
-        over = where[dones[where] | (self.clock.used[where] >= self.rules.max_options)]
-        episodes = {int(i): self._finish_episode(i, observation, bool(dones[i]), infos[i]) for i in over}
+        """Finish episodes and begin options."""
+        over = where[dones[where]]
+        episodes = {int(index): self._finish_episode(index, infos[index]) for index in over}
         if len(over):
             self._begin_episodes(over, {key: observation[key][over] for key in GOAL_KEYS})
-            dones[over] = True
+            self._refuse_bad(observation)
         self._begin_options(where, observation)
         return episodes
 
-    def _finish_episode(
-        self, index: int, observation: dict[str, FloatArray], done: bool, info: dict[str, Any]
-    ) -> Episode:
-        truncated = bool(info.get("TimeLimit.truncated", False)) or not done
-        success = bool(info.get("is_success", False)) and done
-        episode = self._recorder.finish(index, not truncated, success, budget_exhausted=not done)
-        if not done:  # the environment itself would go on: end the episode for it
-            info["terminal_observation"] = {key: np.array(observation[key][index]) for key in GOAL_KEYS}
-            info["TimeLimit.truncated"] = True
-            info["episode"] = {"r": float(episode.rewards.sum()), "l": episode.length, "t": 0.0}
-            fresh, _ = self.venv.env_method("reset", indices=[int(index)])[0]
-            for key in GOAL_KEYS:
-                observation[key][index] = fresh[key]
-        return episode
+    def _finish_episode(self, index: int, info: dict[str, Any]) -> Episode:
+        truncated, exhausted = info.get("TimeLimit.truncated", False), info.get(BUDGET_EXHAUSTED, False)
+        success = bool(info.get("is_success", False)) and not exhausted
+        return self._recorder.finish(index, not truncated, success, bool(exhausted))
 
     def _begin_episodes(self, where: Indices, observation: GoalObservation) -> None:
         self.clock.begin_episode(where)
@@ -248,6 +272,21 @@ class HierarchicalVecEnv(VecEnvWrapper):
         proposal = self.high_level(self.views.high(seen), where)
         unit = proposal.unit_actions if self.schedule is None else self.schedule(proposal.unit_actions, seen)
         self.clock.begin(where, unit, proposal.testing)
+        self._announce(where)
+
+    def _announce(self, where: Indices) -> None:
+        """Tell the environments which windows are the last of their episodes."""
+        for index in where[self.clock.used[where] >= self.rules.max_options]:
+            self.venv.env_method(ANNOUNCE, self._last_window(index), indices=[int(index)])
+
+    def _last_window(self, index: int) -> LastWindow:
+        """What the live option of an environment is, for the task to end the episode with it."""
+        elapsed = self.clock.elapsed[index]
+        steps = max(1, math.ceil(self.clock.time_budget[index] - elapsed))
+        if not self._task_can_tell:
+            return LastWindow(steps)
+        subgoal = self.clock.subgoal[index].copy() if self.rules.ends_when_reached else None
+        return LastWindow(steps, self.views.subgoals, subgoal, math.ceil(self.rules.dt_min) - int(elapsed))
 
     def _low_observation(self, observation: GoalObservation) -> FloatArray:
         remaining = self.rules.remaining(self.clock.time_left)

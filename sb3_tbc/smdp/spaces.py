@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +13,45 @@ from sb3_tbc.arrays import FloatArray as FloatArray
 
 GoalObservation = Mapping[str, NDArray[Any]]
 """A goal environment's observation: ``observation``, ``achieved_goal``, ``desired_goal``, single or batched."""
+
+
+class Slice(NamedTuple):
+    """Neighbouring entries of one part of a goal observation."""
+
+    key: str
+    start: int = 0
+    stop: int | None = None  # the first entry left out; None: to the end
+
+
+@dataclass(frozen=True)
+class Slices:
+    """A map from goal observations to vectors that is plain data: it can be compared, saved, and sent anywhere.
+
+    :param parts: the entries, laid end to end
+    """
+
+    parts: tuple[Slice, ...]
+
+    def __call__(self, observation: GoalObservation) -> FloatArray:
+        """The entries, laid end to end, ``(..., n)``."""
+        found = [observation[part.key][..., part.start : part.stop] for part in self.parts]
+        return found[0] if len(found) == 1 else np.concatenate(found, axis=-1)
+
+    @classmethod
+    def of(cls, given: Iterable[str | Sequence[Any]]) -> Slices:
+        """From names of parts and ``(name, start, stop)``.
+
+        :raises ValueError: if a part has another form
+        """
+        return cls(tuple(_slice(part) for part in given))
+
+
+def _slice(given: str | Sequence[Any]) -> Slice:
+    parts: tuple[Any, ...] = (given,) if isinstance(given, str) else tuple(given)
+    numbers = [number for number in parts[1:] if number is not None]
+    if not 1 <= len(parts) <= 3 or not isinstance(parts[0], str) or not all(type(n) is int for n in numbers):
+        raise ValueError(f"a slice is the name of an observation's part, or (name, start, stop), got {given!r}")
+    return Slice(*parts)
 
 
 class SubgoalSpace:
@@ -84,6 +124,45 @@ class SubgoalSpace:
         for index in self.rotations:
             if not 0 <= index < len(self.groups) or len(self.groups[index]) != 4:
                 raise ValueError(f"rotations must name groups of four coordinates of {self.groups}, got {index}")
+
+    @classmethod
+    def from_slices(
+        cls,
+        low: ArrayLike,
+        high: ArrayLike,
+        thresholds: ArrayLike,
+        achieved: Iterable[str | Sequence[Any]] = ("achieved_goal",),
+        local: Iterable[str | Sequence[Any]] = ("observation",),
+        *,
+        local_scale: ArrayLike,
+        names: Sequence[str],
+        groups: Sequence[Sequence[int]] | None = None,
+        event: int | None = None,
+    ) -> SubgoalSpace:
+        """A subgoal space whose maps only pick entries of the observation, and are therefore plain data.
+
+        It travels to other processes and into files without code. An example::
+
+            SubgoalSpace.from_slices(
+                [-1, -1], [1, 1], [0.1, 0.1], achieved=[("observation", 0, 2)], local=["observation"],
+                local_scale=np.ones(6), names=["x", "y"],
+            )
+
+        :param achieved: where the subgoal-space point of an observation stands: names of its parts, or
+            ``(name, start, stop)``, laid end to end
+        :param local: likewise what the low level sees
+
+        Other parameters are the class's own.
+        :raises ValueError: if a slice has another form, or see the class
+        """
+        return cls(
+            low, high, thresholds, Slices.of(achieved), Slices.of(local), local_scale, names, groups=groups, event=event
+        )
+
+    @property
+    def is_data(self) -> bool:
+        """Whether its maps are plain data, see :meth:`from_slices`."""
+        return isinstance(self._achieved, Slices) and isinstance(self._local, Slices)
 
     @property
     def dim(self) -> int:

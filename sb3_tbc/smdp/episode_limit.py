@@ -1,0 +1,249 @@
+"""Ends an episode when the high level's decisions are used up, where every other end of an episode comes from.
+
+The agent alone knows when that is, but whoever watches episodes (``Monitor``, ``VecMonitor``, any wrapper) has to see
+it as an ordinary truncation. So the agent announces the last window of an episode when it begins, and the environment
+itself truncates the step that ends it.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import RecordConstructorArgs
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.faults import fault
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
+
+ANNOUNCE = "announce_last_window"
+"""Method of an environment that can end an episode for the agent."""
+
+BUDGET_EXHAUSTED = "budget_exhausted"
+"""Key of ``info``: the episode ended with this step because the high level's decisions are used up."""
+
+
+class LastWindow(NamedTuple):
+    """The last window that an episode may have.
+
+    :param steps: environment steps until its time budget is spent
+    :param subgoals: to see whether it ends earlier; None: it runs to the end of its budget
+    :param subgoal: what was asked for; None where reaching it does not end the window
+    :param not_before: the first of its coming steps that reaching the subgoal may end
+    """
+
+    steps: int
+    subgoals: SubgoalSpace | None = None
+    subgoal: FloatArray | None = None
+    not_before: int = 1
+
+    def over(self, passed: int, seen: GoalObservation) -> bool:
+        """Whether the window is over after so many of its coming steps.
+
+        :param seen: what the last of them led to
+        """
+        if passed >= self.steps or self.subgoals is None:
+            return passed >= self.steps
+        if bool(self.subgoals.happened(seen)):
+            return True
+        if self.subgoal is None or passed < self.not_before:
+            return False
+        return bool(self.subgoals.reached(self.subgoals.achieved(seen), self.subgoal))
+
+
+class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+    """Truncates the step that ends the last window which the agent announced, and refuses what no step may give.
+
+    :param env: the task itself; wrappers belong around this one, so that they see the end of the episode
+    :param index: its number in the vector, for messages
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], index: int = 0) -> None:
+        RecordConstructorArgs.__init__(self, index=index)
+        gym.Wrapper.__init__(self, env)
+        self.index = index
+        self.task_space = space = env.observation_space
+        self._parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
+        self._shapes = [(key, part.shape) for key, part in self._parts.items()]
+        self._last: LastWindow | None = None
+        self._passed = self._steps = 0
+
+    def announce_last_window(self, window: LastWindow) -> None:
+        """End the episode with this window."""
+        self._last, self._passed = window, 0
+
+    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode, and forget what was announced."""
+        self._last, self._steps = None, 0
+        try:
+            observation, info = self.env.reset(**kwargs)
+        except Exception as error:  # a task's own code may fail in any way
+            raise fault(self.index, self._steps, error) from error
+        self._check(observation, info)
+        return observation, info
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Step; the last observation of an episode is a copy, as some environments write into the same arrays again.
+
+        :raises EnvironmentFault: if the task's own code fails, naming environment and step
+        :raises ValueError: if the observation is not of the shape that its space says
+        """
+        self._steps += 1
+        try:
+            observation, reward, terminated, truncated, info = self.env.step(action)
+        except Exception as error:  # a task's own code may fail in any way
+            raise fault(self.index, self._steps, error) from error
+        self._check(observation, info)
+        if self._last is not None and not (terminated or truncated):
+            self._passed += 1
+            truncated = self._last.over(self._passed, self._as_declared(observation))
+            if truncated:
+                info = {**info, BUDGET_EXHAUSTED: True}
+        if (terminated or truncated) and isinstance(observation, dict):
+            observation = {key: np.array(part) for key, part in observation.items()}
+        return observation, reward, terminated, truncated, info
+
+    def _check(self, observation: Any, info: Any) -> None:
+        for key, shape in self._shapes:
+            part = observation.get(key) if isinstance(observation, dict) else None
+            if part is None or np.shape(part) != shape:
+                got = "nothing" if part is None else f"shape {np.shape(part)}"
+                raise ValueError(
+                    f"environment {self.index}, step {self._steps} of its episode: observation[{key!r}] must have "
+                    f"shape {shape} as its space says, got {got}"
+                )
+        if not isinstance(info, dict):
+            raise ValueError(
+                f"environment {self.index}, step {self._steps} of its episode: info must be a dictionary, got {info!r}"
+            )
+
+    def _as_declared(self, observation: Any) -> Any:
+        """The observation in the precision in which vectors of environments hand it on."""
+        return {key: np.asarray(observation[key], dtype=self._parts[key].dtype) for key in GOAL_KEYS}
+
+
+class LimitingVecEnv(VecEnvWrapper):
+    """The same for environments that cannot be reached, such as those of other processes.
+
+    Whatever is wrapped around this vector sees the end of the episode; a ``Monitor`` in another process does not.
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        super().__init__(venv)
+        self._last: dict[int, LastWindow] = {}
+        self._passed = np.zeros(venv.num_envs, dtype=np.int64)
+        self._returns = np.zeros(venv.num_envs)
+        self._lengths = np.zeros(venv.num_envs, dtype=np.int64)
+        self._began = time.time()
+
+    def has_attr(self, attr_name: str) -> bool:
+        """Whether the environments have an attribute."""
+        return attr_name == ANNOUNCE or super().has_attr(attr_name)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """Call a method of the environments; announcements end here."""
+        if method_name != ANNOUNCE:
+            return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
+        for index in self._get_indices(indices):
+            self._last[index], self._passed[index] = method_args[0], 0
+        return []
+
+    def reset(self) -> VecEnvObs:
+        """Begin an episode everywhere."""
+        self._last.clear()
+        self._returns[:], self._lengths[:] = 0.0, 0
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step; end the episodes whose last window is over."""
+        observation, rewards, dones, infos = self.venv.step_wait()
+        self._returns += rewards
+        self._lengths += 1
+        for index, window in list(self._last.items()):
+            self._passed[index] += 1
+            seen: Any = {key: observation[key][index] for key in GOAL_KEYS}  # type: ignore[call-overload]
+            if not dones[index] and window.over(int(self._passed[index]), seen):
+                self._end(index, observation, dones, infos[index])
+        for ended in np.flatnonzero(dones):
+            self._last.pop(int(ended), None)
+            self._returns[ended], self._lengths[ended] = 0.0, 0
+        return observation, rewards, dones, infos
+
+    def _end(self, index: int, observation: Any, dones: Any, info: dict[str, Any]) -> None:
+        episode = {"r": float(self._returns[index]), "l": int(self._lengths[index]), "t": time.time() - self._began}
+        info |= {BUDGET_EXHAUSTED: True, "TimeLimit.truncated": True, "episode": episode}
+        info["terminal_observation"] = {key: np.array(part[index]) for key, part in observation.items()}
+        fresh, self.reset_infos[index] = self.venv.env_method("reset", indices=[index])[0]
+        for key, part in observation.items():
+            part[index] = fresh[key]
+        dones[index] = True
+
+
+class MonitorOfLimit(Monitor):
+    """What a ``Monitor`` in another process is for a moment, so that the limit can be put beneath it."""
+
+    def put_limit(self, index: int) -> None:
+        """Put the limit around the task itself.
+
+        :param index: the environment's number in the vector
+        """
+        self.__class__ = Monitor  # type: ignore[assignment]
+        _put_limit(self, index)
+
+
+def with_episode_limit(venv: VecEnv) -> VecEnv:
+    """See that the environments of a vector can end an episode for the agent, and return the vector to use.
+
+    The limit goes around each task itself where it can be reached: in this process, and beneath a ``Monitor`` that is
+    outermost in another one. Elsewhere it goes around the innermost vector.
+    """
+    if venv.has_attr(ANNOUNCE):
+        return venv
+    base: Any = venv
+    around: VecEnvWrapper | None = None
+    while isinstance(base, VecEnvWrapper):
+        base, around = base.venv, base
+    if isinstance(base, DummyVecEnv):
+        base.envs = [_put_limit(env, index) for index, env in enumerate(base.envs)]
+    elif base.has_attr("class_name") and set(base.env_method("class_name")) == {"Monitor"}:
+        base.set_attr("__class__", MonitorOfLimit)
+        for index in range(base.num_envs):
+            base.env_method("put_limit", index, indices=[index])
+    elif around is None:
+        return LimitingVecEnv(base)
+    else:
+        around.venv = LimitingVecEnv(base)
+    return venv
+
+
+def can_tell(venv: VecEnv, subgoals: SubgoalSpace) -> bool:
+    """Whether the limit sees what the agent sees, so that it can tell that a subgoal is reached or an event happened.
+
+    :param venv: what the agent acts in, with :func:`with_episode_limit`
+    :param subgoals: the agent's
+    """
+    base: Any = venv
+    while isinstance(base, VecEnvWrapper) and not isinstance(base, LimitingVecEnv):
+        base = base.venv
+    if isinstance(base, LimitingVecEnv):
+        return bool(base.observation_space == venv.observation_space)
+    same = all(space == venv.observation_space for space in venv.get_attr("task_space"))
+    return same and (isinstance(base, DummyVecEnv) or subgoals.is_data)
+
+
+def _put_limit(env: gym.Env[Any, Any], index: int) -> gym.Env[Any, Any]:
+    """Put the limit around the task itself, beneath its wrappers; the outermost environment."""
+    if not isinstance(env, gym.Wrapper):
+        return EpisodeLimit(env, index)
+    inner = env
+    while isinstance(inner.env, gym.Wrapper):
+        inner = inner.env
+    inner.env = EpisodeLimit(inner.env, index)
+    return env
