@@ -27,6 +27,7 @@ help:
 # The stamp is newer than the files that decide what is installed: nothing is done twice.
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	@scripts/system-packages.sh
+	@scripts/browser.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --editable '.[tests]' --constraint constraints.txt
 	@touch $@

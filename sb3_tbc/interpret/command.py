@@ -16,6 +16,7 @@ from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.interpret.episodes import FIRST_SEED, HeldOutEpisodes
 from sb3_tbc.interpret.features import space_of
 from sb3_tbc.interpret.findings import Effort, Findings, investigate, to_plain
+from sb3_tbc.interpret.page import live_page
 from sb3_tbc.interpret.picture import activation_in_space, units_shown
 from sb3_tbc.interpret.text import describe
 from sb3_tbc.interpret.units import units_of
@@ -27,6 +28,7 @@ from sb3_tbc.zoo.ledger import to_json
 EXAMPLES = {
     "sb3_tbc.interpret pretrained:Pendulum": "all measures, on 20 held-out episodes",
     "sb3_tbc.interpret model.zip --json inside.json --png inside.png": "every figure, and activation in space",
+    "sb3_tbc.interpret pretrained:Drawbridge --html inside.html": "a page in which the circuit runs; open it offline",
     "sb3_tbc.interpret model.zip --n-episodes 100 --synapses": "narrower intervals, and every synapse cut",
 }
 MOST_IN_PICTURE = 8
@@ -43,6 +45,8 @@ def build_parser() -> Parser:
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first episode")
     parser.add_argument("--json", type=Path, metavar="OUT.json", help="write every figure")
     parser.add_argument("--png", type=Path, metavar="OUT.png", help="draw activation in space, as the paper's figure 5")
+    parser.add_argument("--html", type=Path, metavar="OUT.html", help="write a page in which the circuit runs, in one "
+                        "file")  # fmt: skip
     parser.add_argument("--n-random", type=positive_int, default=5, help="random lesions of each size")
     parser.add_argument("--max-alone", type=positive_int, default=24, help="units lesioned one by one, the most "
                         "active ones first")  # fmt: skip
@@ -65,28 +69,30 @@ def command(argv: Sequence[str]) -> int:
     try:
         effort = Effort(args.n_random, args.max_alone, args.synapses)
         found = investigate(model, units, space, info["task"], episodes, effort)
+        print(describe(found), end="")
+        _write(args, found, model, info, episodes)
     finally:
         episodes.close()
-    print(describe(found), end="")
-    identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}
-    plain = to_plain(found, {**identity, "n_timesteps": int(model.num_timesteps), "first_episode_seed": args.seed})
-    if args.json is not None:
-        write_atomic(args.json, to_json(plain))
-    _draw(args, found, model, info, plain)
     return 0
 
 
-def _draw(args: Any, found: Findings, model: TBCHRL, info: dict[str, Any], plain: dict[str, Any]) -> None:
-    """Write the picture and the page that were asked for."""
-    if args.png is None:
-        return
+def _write(args: Any, found: Findings, model: TBCHRL, info: dict[str, Any], episodes: HeldOutEpisodes) -> None:
+    """Write the files that were asked for."""
     space, subgoals = space_of(info["task"], model.layout.subgoals), model.layout.subgoals
+    identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}
+    if args.json is not None:
+        about = {**identity, "n_timesteps": int(model.num_timesteps), "first_episode_seed": args.seed}
+        write_atomic(args.json, to_json(to_plain(found, about)))
+    if args.png is None and args.html is None:
+        return
     which = units_shown(found.units, found.activity)
     layer = "command neurons" if found.kind == "circuit" else "units of the last hidden layer"
     title = f"{found.task}: potential of {layer} along the trajectory"
     picture = activation_in_space(found.traces[:MOST_IN_PICTURE], found.units, which, space, subgoals, title)
     if args.png is not None:
         save_atomic(lambda path: Path(path).write_bytes(picture), args.png)
+    if args.html is not None:
+        write_atomic(args.html, live_page(model, found, space, episodes, info, picture))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

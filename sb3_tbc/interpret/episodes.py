@@ -74,12 +74,16 @@ class HeldOutEpisodes:
         self, model: TBCHRL, env_id: str, env_kwargs: dict[str, Any], n_episodes: int, seed: int = FIRST_SEED
     ) -> None:
         self.model, self.n_episodes, self.seed = model, n_episodes, seed
-        self._make = partial(make_env, env_id, **env_kwargs)
+        self.make_env = partial(make_env, env_id, **env_kwargs)
         self._venvs: dict[int, _SeededVecEnv] = {}
 
     def record(self, units: Units, lesion: Lesion) -> list[Trace]:
         """Every episode under one lesion, with all that the units did."""
         return self._run(units, [lesion] * self.n_episodes, list(range(self.n_episodes)))
+
+    def record_one(self, units: Units, lesion: Lesion) -> list[Trace]:
+        """The first episode alone, under one lesion."""
+        return self._run(units, [lesion], [0])
 
     def outcomes(self, units: Units, lesions: Sequence[Lesion]) -> list[Outcome]:
         """How all episodes end under each of several lesions."""
@@ -94,7 +98,7 @@ class HeldOutEpisodes:
 
     def _run(self, units: Units, lesions: Sequence[Lesion], which: Sequence[int]) -> list[Trace]:
         if len(which) not in self._venvs:
-            self._venvs[len(which)] = _SeededVecEnv([self._make] * len(which))
+            self._venvs[len(which)] = _SeededVecEnv([self.make_env] * len(which))
         venv = self._venvs[len(which)]
         venv.start_from([self.seed + i for i in which])
         return run_once(self.model, units, venv, stack(lesions))

@@ -12,7 +12,14 @@ from sb3_tbc.interpret.lesions import Drop, LesionResult
 
 def describe(found: Findings) -> str:
     """All findings, in plain words."""
-    parts = [_head(found), _figures(found), _lesions(found), _correlation(found), _information(found), _time(found)]
+    parts = [
+        _head(found),
+        _table(figure_rows(found)),
+        _lesions(found),
+        _correlation(found),
+        _information(found),
+        _time(found),
+    ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -27,7 +34,8 @@ def _head(found: Findings) -> str:
     )
 
 
-def _figures(found: Findings) -> str:
+def figure_rows(found: Findings) -> list[tuple[str, str, str, str]]:
+    """The paper's figures, ours, and those of the controls; the first row is the head."""
     ours = summary(found)
     rows = [("", "paper (UR5)", "here", "control")]
     rows.append((
@@ -47,7 +55,7 @@ def _figures(found: Findings) -> str:
             f"bits about the phase of the window, {label}", f"{PAPER[f'information_{name}']:.2f}",
             _number(ours[f"information_{name}"]), f"{_number(ours['information_control'])} (phases shifted)",
         ))  # fmt: skip
-    return _table(rows)
+    return rows
 
 
 def _lesions(found: Findings) -> str:
