@@ -19,8 +19,9 @@ from sb3_tbc.errors import HierarchyError, NonFiniteError
 from sb3_tbc.level.acting import FrozenActor
 from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.level.spaces_only import SpacesOnlyVecEnv
-from sb3_tbc.level.update import AVERAGE_DECAY, SACUpdate
+from sb3_tbc.level.update import AVERAGE_DECAY, EXTREMES, SACUpdate
 from sb3_tbc.replay.batch import LevelBatch
+from sb3_tbc.smdp.bounds import ValueBounds
 
 FloatArray = NDArray[np.floating[Any]]
 
@@ -42,6 +43,15 @@ class LabelledBuffer(BurstBuffer, Protocol):
         """Sample tensors as :meth:`sample_burst`, and labels ``(gradient_steps, batch_size, 1)`` in [-1, 1]."""
 
 
+def add_figures(total: dict[str, float], part: dict[str, float], share: float) -> None:
+    """Add what one burst of updates measured to ``total``: means by the burst's share, extremes as they are."""
+    for key, value in part.items():
+        if key in EXTREMES:
+            total[key] = EXTREMES[key](total.get(key, value), value)
+        else:
+            total[key] = total.get(key, 0.0) + share * value
+
+
 class SACLevel(SAC):
     """SAC for one level. It neither collects nor stores: ``replay_buffer`` is filled by whoever owns the level.
 
@@ -56,6 +66,8 @@ class SACLevel(SAC):
     :param label_coef: weight of a regression of the last action coordinate toward labels of the replay buffer in the
         actor's loss (the paper's duration loss); if positive, batches come from ``replay_buffer.sample_labelled``
     :param average_decay: decay per update of the averaged actor, which acts where deterministic actions are asked for
+    :param bounds: targets of the critics are clipped to them, see :mod:`sb3_tbc.smdp.bounds`; None does not clip
+    :param actor_q: which value of the critics the actor climbs, see :class:`.SACUpdate`
 
     Other parameters are SB3's; ``policy_kwargs`` are :class:`LevelPolicy`'s.
     """
@@ -82,6 +94,8 @@ class SACLevel(SAC):
         name: str = "level",
         label_coef: float = 0.0,
         average_decay: float = AVERAGE_DECAY,
+        bounds: ValueBounds | None = None,
+        actor_q: str | float = "min",
     ) -> None:
         super().__init__(
             LevelPolicy if isinstance(policy, str) else policy,
@@ -102,6 +116,7 @@ class SACLevel(SAC):
         self.actor_lr_schedule = None if actor_learning_rate is None else FloatSchedule(actor_learning_rate)
         self.log_prefix = f"{name}/"
         self.label_coef, self.average_decay = label_coef, average_decay
+        self.bounds, self.actor_q = bounds, actor_q
         self.set_logger(Logger(folder=None, output_formats=[]))
         self._setup_model()
         self.replay_buffer = replay_buffer  # type: ignore[assignment]
@@ -118,6 +133,8 @@ class SACLevel(SAC):
             compile=self.compile,
             label_coef=self.label_coef,
             average_decay=self.average_decay,
+            bounds=self.bounds,
+            actor_q=self.actor_q,
         )
         self._frozen = {average: FrozenActor(self.policy, average) for average in (False, True)}
 
@@ -148,17 +165,16 @@ class SACLevel(SAC):
             raise HierarchyError(f"{self.log_prefix[:-1]} has no replay buffer; set its replay_buffer before train")
         self.policy.set_training_mode(True)
         self._set_learning_rates()
-        sums: dict[str, float] = {}
+        figures: dict[str, float] = {}
         burst = max(1, BURST_ROWS // batch_size)
         for start in range(0, gradient_steps, burst):
             steps = min(burst, gradient_steps - start)
-            for key, value in self._run(steps, batch_size).items():
-                sums[key] = sums.get(key, 0.0) + steps * value
+            add_figures(figures, self._run(steps, batch_size), steps / gradient_steps)
             self.policy.after_updates(steps)
         self._n_updates += gradient_steps
         self._check_finite()
-        for key, total in sums.items():
-            self.logger.record(self.log_prefix + key, total / gradient_steps)
+        for key, value in figures.items():
+            self.logger.record(self.log_prefix + key, value)
         self.logger.record(self.log_prefix + "n_updates", self._n_updates, exclude="tensorboard")
 
     def _run(self, gradient_steps: int, batch_size: int) -> dict[str, float]:

@@ -213,6 +213,7 @@ class LevelPolicy(SACPolicy):
     by the update and saved with the policy. The deterministic policy of the average is steadier than the latest one's.
 
     :param negative_critic: see :class:`LevelCritic`
+    :param critic_norm: see :class:`.LevelCritic`
     :param mean_bound: see :class:`GaussianHead`
     :param log_std_bounds: see :class:`GaussianHead`
     :param ndbc: None for an MLP actor, else the circuit's numbers, see :class:`NDBCActor`
@@ -234,6 +235,7 @@ class LevelPolicy(SACPolicy):
         lr_schedule: Schedule,
         *args: Any,
         negative_critic: bool = False,
+        critic_norm: str = "none",
         mean_bound: float | None = None,
         log_std_bounds: tuple[float, float] = (LOG_STD_MIN, LOG_STD_MAX),
         ndbc: Mapping[str, Any] | None = None,
@@ -245,6 +247,7 @@ class LevelPolicy(SACPolicy):
             raise ConfigError("a level has neither use_sde nor share_features_extractor; leave both False")
         self.level_kwargs: dict[str, Any] = {
             "negative_critic": negative_critic,
+            "critic_norm": critic_norm,
             "mean_bound": mean_bound,
             "log_std_bounds": (float(log_std_bounds[0]), float(log_std_bounds[1])),
             "ndbc": None if ndbc is None else dict(ndbc),
@@ -286,9 +289,10 @@ class LevelPolicy(SACPolicy):
         return NDBCActor(ndbc=ndbc, **bounds, **{key: kwargs[key] for key in shared}).to(self.device)
 
     def make_critic(self, features_extractor: Any = None) -> LevelCritic:
-        """Build the critics, unbounded or negative."""
+        """Build the critics."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
-        return LevelCritic(negative=self.level_kwargs["negative_critic"], **kwargs).to(self.device)
+        negative, norm = self.level_kwargs["negative_critic"], self.level_kwargs["critic_norm"]
+        return LevelCritic(negative=negative, norm=norm, **kwargs).to(self.device)
 
 
 def copy_actor(actor: MLPActor | NDBCActor) -> MLPActor | NDBCActor:

@@ -18,7 +18,7 @@ class Block(NamedTuple):
     """Parameters that lie one after the other in flat storage, and the shape in which they are used together."""
 
     shape: tuple[int, ...]
-    parameters: tuple[nn.Parameter, ...]
+    parameters: tuple[th.Tensor, ...]
 
 
 def linear_layers(module: nn.Module) -> list[nn.Linear]:

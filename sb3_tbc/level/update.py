@@ -16,71 +16,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch as th
-from torch.utils._pytree import tree_flatten, tree_leaves, tree_unflatten
+from torch.utils._pytree import TreeSpec, tree_flatten, tree_leaves, tree_unflatten
 
 from sb3_tbc.level.compilation import compile_step
+from sb3_tbc.level.critics import BATCH_MOMENTUM
 from sb3_tbc.level.policies import LevelPolicy
+from sb3_tbc.level.step_inputs import Given, LearntState, Moments, Schedules, StepInputs
 from sb3_tbc.level.storage import FlatParameters, flat_adam
 from sb3_tbc.replay.batch import LevelBatch
+from sb3_tbc.smdp.bounds import ValueBounds
 
-DIAGNOSTICS = ("critic_loss", "actor_loss", "ent_coef_loss", "ent_coef", "q_mean", "entropy")
+DIAGNOSTICS = ("critic_loss", "actor_loss", "ent_coef_loss", "ent_coef", "q_mean", "entropy", "target_clipped")
+"""Of which the mean is logged; ``target_clipped`` is the share of targets that were moved to a bound."""
+EXTREMES: dict[str, Callable[[float, float], float]] = {"target_min": min, "target_max": max}
+"""Of which the lowest and the highest are logged: the critics' targets."""
+ACTOR_Q = {"min": 0.0, "max": 1.0, "mean": None}
+"""Names of :class:`SACUpdate`'s ``actor_q``; the mean is a mean of all critics, also where there are more than two."""
 AVERAGE_DECAY = 0.999
 """Decay per update of the averaged actor unless given; during the first updates (1 + n) / (10 + n) if smaller."""
 SQUASH_EPSILON = 1e-6
 """Added inside the logarithm of tanh's derivative, as SB3 does."""
 HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
-
-
-class Schedules(NamedTuple):
-    """Numbers that vary from update to update, as 0-dim tensors."""
-
-    actor_step: th.Tensor  # learning rate / (1 - beta1^n)
-    critic_step: th.Tensor
-    ent_coef_step: th.Tensor
-    correction: th.Tensor  # 1 / sqrt(1 - beta2^n)
-    tau: th.Tensor
-    average_weight: th.Tensor  # 1 - decay of the averaged actor
-    target_entropy: th.Tensor
-
-
-class Moments(NamedTuple):
-    """Adam's running means for one flat parameter."""
-
-    mean: th.Tensor
-    square: th.Tensor
-
-
-class LearntState(NamedTuple):
-    """What an update starts from. All but ``constants`` is changed in place."""
-
-    sums: th.Tensor  # (len(DIAGNOSTICS),)
-    ent: th.Tensor  # temperature, or its logarithm when it is automatic
-    actor: th.Tensor
-    critic: th.Tensor
-    target: th.Tensor
-    average: th.Tensor
-    moments: tuple[Moments, ...]  # of actor, critics and, when it is automatic, temperature
-    constants: list[th.Tensor]  # the actor's tensors that are not trained
-
-
-class Given(NamedTuple):
-    """What is new in each update; a burst of updates has one more leading dimension."""
-
-    row: th.Tensor  # (len(Schedules._fields),)
-    noise: th.Tensor  # (2, batch, action_dim): for the actions at the observations and at the next observations
-    labels: tuple[th.Tensor, ...]  # (batch, 1), what the last action coordinate is drawn toward, or none
-    batch: LevelBatch
-
-
-class StepInputs(NamedTuple):
-    """Arguments of one update."""
-
-    state: LearntState
-    given: Given
 
 
 def squash(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -92,6 +53,21 @@ def squash(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Te
     return actions, log_prob.sum(dim=-1, keepdim=True)
 
 
+def optimism_of(actor_q: str | float) -> float | None:
+    """Where between the smallest (0) and the largest (1) critic the actor's value lies; None for the mean.
+
+    :raises ValueError: for another value of ``actor_q``
+    """
+    if isinstance(actor_q, str) and actor_q in ACTOR_Q:
+        return ACTOR_Q[actor_q]
+    if isinstance(actor_q, int | float) and not isinstance(actor_q, bool) and 0.0 <= actor_q <= 1.0:
+        return float(actor_q)
+    raise ValueError(
+        f"actor_q must be 'min', 'mean', 'max' or a number from 0 (the smallest critic) to 1 (the largest), got "
+        f"{actor_q!r}"
+    )
+
+
 class SACUpdate:
     """The update of one level: flat storage for its policy, and the step that changes it.
 
@@ -101,6 +77,11 @@ class SACUpdate:
     :param compile: "auto" (compiled if there is a C++ compiler), True or False
     :param label_coef: weight of the squared distance between the actor's last action coordinate and given labels
     :param average_decay: decay per update of the averaged actor
+    :param bounds: every target is clipped to them, see :mod:`sb3_tbc.smdp.bounds`; None does not clip
+    :param actor_q: which value of the critics the actor climbs: ``"min"`` as in SAC, ``"mean"``, ``"max"``, or a number
+        between 0 (the smallest) and 1 (the largest). Small actors beside large critics learn less of a pessimistic one
+        (arXiv 2506.01016). Targets always take the smallest
+    :raises ValueError: for bounds that hold nothing and another ``actor_q``
     """
 
     def __init__(
@@ -111,12 +92,19 @@ class SACUpdate:
         compile: bool | str = "auto",
         label_coef: float = 0.0,
         average_decay: float = AVERAGE_DECAY,
+        bounds: ValueBounds | None = None,
+        actor_q: str | float = "min",
     ) -> None:
+        if bounds is not None and not bounds.low < bounds.high:
+            raise ValueError(f"target_bounds must be [low, high] with low < high, got [{bounds.low}, {bounds.high}]")
+        self.bounds, self.optimism = bounds, optimism_of(actor_q)
         self.policy = policy
         self.actor = FlatParameters(policy.actor.blocks())
         self.critic = FlatParameters(policy.critic.blocks())
         self.target = FlatParameters(policy.critic_target.blocks())
         self.average = FlatParameters(policy.average_actor.blocks())
+        statistics = policy.critic.statistics()
+        self.statistics = FlatParameters(statistics) if statistics else None
         policy.actor.optimizer = flat_adam(self.actor.vector, policy.actor.optimizer)
         policy.critic.optimizer = flat_adam(self.critic.vector, policy.critic.optimizer)
         self.ent_coef_optimizer = ent_coef_optimizer
@@ -125,10 +113,16 @@ class SACUpdate:
         self.label_coef, self.average_decay = label_coef, average_decay
         self._steps: dict[tuple[int, int], Callable[..., None]] = {}
         self._shapes: dict[int, list[th.Size]] = {}  # of what an update is given, by batch size
-        self._structure = tree_flatten(self.example(1, th.zeros(1)))[1]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_steps": {}}
+        state = {**self.__dict__, "_steps": {}}
+        state.pop("_structure", None)
+        return state
+
+    @cached_property
+    def _structure(self) -> TreeSpec:
+        """How the leaves of :class:`StepInputs` belong together."""
+        return tree_flatten(self.example(1, th.zeros(1)))[1]
 
     @property
     def automatic(self) -> bool:
@@ -159,7 +153,7 @@ class SACUpdate:
         :param target_entropy: for the automatic temperature, in nats
         :param ent_coef: fixed temperature, or its logarithm when it is automatic
         :param labels: ``(gradient_steps, batch, 1)`` in [-1, 1], needed where ``label_coef`` is not 0
-        :return: mean over the burst of each of :data:`DIAGNOSTICS`
+        :return: mean over the burst of each of :data:`DIAGNOSTICS`, and :data:`EXTREMES`
         :raises ValueError: for tensors of another shape or type
         """
         n_steps = len(batch.rewards)
@@ -177,7 +171,8 @@ class SACUpdate:
             step(*fixed, *changing)
         for optimizer in self.optimizers():
             self._adam_state(optimizer)["step"] += n_steps
-        return dict(zip(DIAGNOSTICS, (state.sums / n_steps).tolist(), strict=True))
+        means = dict(zip(DIAGNOSTICS, (state.sums / n_steps).tolist(), strict=True))
+        return means | dict(zip(EXTREMES, state.extremes.tolist(), strict=True))
 
     def _given(self, batch_size: int) -> Given:
         """Zeros in the shapes of what one update is given."""
@@ -225,14 +220,18 @@ class SACUpdate:
         """What updates start from and change, read afresh since loading an agent replaces some of it."""
         for flat in (self.actor, self.critic, self.target, self.average):
             flat.sync()
+        if self.statistics is not None:
+            self.statistics.sync()
         adam = [self._adam_state(optimizer) for optimizer in self.optimizers()]
         return LearntState(
             sums=th.zeros(len(DIAGNOSTICS)),
+            extremes=th.tensor([math.inf, -math.inf]),
             ent=ent_coef.data,
             actor=self.actor.vector.data,
             critic=self.critic.vector.data,
             target=self.target.vector.data,
             average=self.average.vector.data,
+            statistics=() if self.statistics is None else (self.statistics.vector.data,),
             moments=tuple(Moments(state["exp_avg"], state["exp_avg_sq"]) for state in adam),
             constants=self.policy.actor.constants(),
         )
@@ -292,8 +291,7 @@ class SACUpdate:
         ent_coef = state.ent.exp() if self.automatic else state.ent.clone()
         surplus = (log_prob.detach() + row.target_entropy).mean()
 
-        target_q = self._target_q(x, ent_coef)
-        critic_loss, critic_grad, q_mean = self._critic_loss(x, target_q)
+        critic_grad, critic_diagnostics = self._critic_gradient(x, ent_coef)
         self._adam(1, state, critic_grad, row)
         # The actor's loss looks through the critics that were just changed, as in SB3.
         actor_loss = self._actor_loss(x, actions_pi, log_prob, ent_coef)
@@ -304,9 +302,13 @@ class SACUpdate:
         ent_coef_loss = -(state.ent * surplus).sum() if self.automatic else state.ent.new_zeros(())
         if self.automatic:
             self._adam(2, state, -surplus.expand(1), row)
-        state.target.lerp_(state.critic, row.tau)
+        if self.statistics is None:
+            state.target.lerp_(state.critic, row.tau)
+        else:  # CrossQ has no target networks
+            state.target.copy_(state.critic)
         state.average.lerp_(state.actor, row.average_weight)
-        diagnostics = (critic_loss, actor_loss, ent_coef_loss, ent_coef.sum(), q_mean, -log_prob.mean())
+        critic_loss, q_mean, clipped = critic_diagnostics
+        diagnostics = (critic_loss, actor_loss, ent_coef_loss, ent_coef.sum(), q_mean, -log_prob.mean(), clipped)
         state.sums.add_(th.stack([value.detach() for value in diagnostics]))
 
     def _sample(
@@ -317,37 +319,97 @@ class SACUpdate:
         mean, log_std, _ = self.policy.actor.step_blocks(blocks, x.state.constants, obs, membrane)
         return squash(mean, log_std, noise)
 
-    def _target_q(self, x: StepInputs, ent_coef: th.Tensor) -> th.Tensor:
-        """``r + (1 - done) discount (min Q'(s', a') - alpha log pi(a' | s'))``, ``(batch, 1)``."""
-        state, batch = x.state, x.given.batch
-        with th.no_grad():
-            actions, log_prob = self._sample(
-                state.actor, x, batch.next_observations, batch.next_states, x.given.noise[1]
-            )
-            q = self.policy.critic.q_blocks(self.target.unflatten(state.target), batch.next_observations, actions)
-            return batch.rewards + (1 - batch.dones) * batch.discounts * (q.amin(dim=0) - ent_coef * log_prob)
-
-    def _critic_loss(self, x: StepInputs, target_q: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """Half the summed mean squared errors, its gradient, and the mean Q-value."""
+    def _critic_gradient(self, x: StepInputs, ent_coef: th.Tensor) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
+        """Gradient of half the summed mean squared errors; that loss, the mean value, the share of clipped targets."""
         batch = x.given.batch
+        with th.no_grad():
+            observed = batch.next_observations, batch.next_states
+            actions, log_prob = self._sample(x.state.actor, x, *observed, x.given.noise[1])
         with th.enable_grad():
             leaf = x.state.critic.detach().requires_grad_()
-            q = self.policy.critic.q_blocks(self.critic.unflatten(leaf), batch.observations, batch.actions)
+            if self.statistics is None:
+                target_q, clipped = self._target_q(x, self._next_q(x, actions), log_prob, ent_coef)
+                q = self.policy.critic.q_blocks(self.critic.unflatten(leaf), batch.observations, batch.actions)
+            else:
+                q, next_q = self._joint_q(x, leaf, actions)
+                target_q, clipped = self._target_q(x, next_q, log_prob, ent_coef)
             loss = 0.5 * (q - target_q).square().mean(dim=(1, 2)).sum()
             (grad,) = th.autograd.grad(loss, leaf)
-        return loss, grad, q.mean()
+        return grad, (loss, q.mean(), clipped)
+
+    def _next_q(self, x: StepInputs, next_actions: th.Tensor) -> th.Tensor:
+        """The target networks' values of the next actions, ``(n_critics, batch, 1)``."""
+        with th.no_grad():
+            blocks = self.target.unflatten(x.state.target)
+            return self.policy.critic.q_blocks(blocks, x.given.batch.next_observations, next_actions)
+
+    def _joint_q(self, x: StepInputs, leaf: th.Tensor, next_actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Values ``(n_critics, batch, 1)`` of the stored actions and, without gradient, of the next ones, without
+        target networks; the running statistics move on.
+        """
+        # Batch normalisation must see both kinds of actions at once: the policy's next actions are distributed
+        # otherwise than stored ones, and normalised by statistics of the latter alone their values are off. With joint
+        # statistics no target networks are needed (section 3 of arXiv 1902.05605).
+        batch = x.given.batch
+        observations = th.cat((batch.observations, batch.next_observations))
+        actions = th.cat((batch.actions, next_actions))
+        joint, seen = self.policy.critic.q_blocks_of_batch(self.critic.unflatten(leaf), observations, actions)
+        x.state.statistics[0].lerp_(th.cat([part.flatten() for part in seen]), BATCH_MOMENTUM)
+        q, next_q = joint.chunk(2, dim=1)
+        return q, next_q.detach()
+
+    def _target_q(
+        self, x: StepInputs, next_q: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """``r + (1 - done) discount (min Q'(s', a') - alpha log pi(a' | s'))`` within the bounds, ``(batch, 1)``.
+
+        :return: the targets, and the share of them that was clipped
+        """
+        batch = x.given.batch
+        with th.no_grad():
+            soft = next_q.amin(dim=0) - ent_coef * log_prob
+            target_q = batch.rewards + (1 - batch.dones) * batch.discounts * soft
+            clipped = target_q.new_zeros(())
+            if self.bounds is not None:
+                free, target_q = target_q, self._clip(target_q, self.bounds, ent_coef)
+                clipped = (free != target_q).float().mean()
+            lowest, highest = x.state.extremes.unbind()
+            seen = th.minimum(lowest, target_q.amin()), th.maximum(highest, target_q.amax())
+            x.state.extremes.copy_(th.stack(seen))
+        return target_q, clipped
+
+    def _clip(self, target_q: th.Tensor, bounds: ValueBounds, ent_coef: th.Tensor) -> th.Tensor:
+        """Targets within the bounds; the upper one has room for the entropy of later actions."""
+        # An action in [-1, 1]^d has at most the uniform distribution's entropy, d log 2 nats.
+        highest = bounds.high + ent_coef * (bounds.later * self.action_dim * math.log(2.0))
+        if self.policy.critic.negative:
+            highest = highest.clamp(max=0.0)
+        return th.minimum(target_q.clamp(min=bounds.low), highest)
 
     def _actor_loss(self, x: StepInputs, actions: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
-        """``alpha log pi - min Q``, and the labels' loss where there are any.
+        """``alpha log pi - Q``, Q what ``actor_q`` says, and the labels' loss where there are any.
 
         The latter is the paper's ``L_dt = E (dt - dt*)^2``, in unit coordinates of the action.
         """
         with th.enable_grad():
-            q = self.policy.critic.q_blocks(self.critic.unflatten(x.state.critic), x.given.batch.observations, actions)
-            loss = (ent_coef * log_prob - q.amin(dim=0)).mean()
+            q = self.policy.critic.q_blocks(
+                self.critic.unflatten(x.state.critic),
+                x.given.batch.observations,
+                actions,
+                [] if self.statistics is None else self.statistics.unflatten(x.state.statistics[0]),
+            )
+            loss = (ent_coef * log_prob - self._ascended(q)).mean()
             for labels in x.given.labels:
                 loss = loss + self.label_coef * (actions[:, -1:] - labels).square().mean()
         return loss
+
+    def _ascended(self, q: th.Tensor) -> th.Tensor:
+        """The value that the actor climbs, ``(batch, 1)``, of all critics' ``(n_critics, batch, 1)``."""
+        if self.optimism is None:
+            return q.mean(dim=0)
+        if self.optimism == 0.0:
+            return q.amin(dim=0)
+        return th.lerp(q.amin(dim=0), q.amax(dim=0), self.optimism)
 
     def _adam(self, which: int, state: LearntState, grad: th.Tensor, row: Schedules) -> None:
         """One step of Adam in place (arXiv 1412.6980).
