@@ -223,7 +223,7 @@ def test_ctrl_c_saves_and_resume_finishes(
         (["--algo", "hit"], "unknown algorithm 'hit'; did you mean 'hits'?"),
         (["--hyperparams", "low.learningrate:1"], "did you mean 'learning_rate'?"),
         (["--hyperparams", "env_kwargs:{observation: compct}"], "observation must be one of"),
-        (["--hyperparams", "random_fraction:2"], "random_fraction must lie in [0, 1], got 2"),
+        (["--hyperparams", "random_fraction:2"], "random_fraction must be a number from 0 to 1, got 2"),
         (["--ablation", "no-tz"], "no ablation 'no-tz'"),
         (["--config-file", "nowhere.yml"], "cannot read configuration nowhere.yml"),
     ],

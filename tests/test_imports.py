@@ -15,7 +15,7 @@ PACKAGE = ROOT / "sb3_tbc"
 # From bottom to top: a folder (or a module beside the folders) imports from itself and from lower layers alone.
 LAYERS = (
     ("former_names", "errors", "stats", "arrays"),
-    ("files", "outside", "stopping"),
+    ("files", "outside", "stopping", "settings"),
     ("commands", "extras", "smdp"),
     ("replay", "ndbc", "tasks", "zoo_configs"),
     ("level",),

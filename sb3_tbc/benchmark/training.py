@@ -100,7 +100,7 @@ def contenders(task: str, config: str | None = None) -> list[Contender]:
 
 
 def _flat(name: str, kind: Any, env: gym.Env[Any, Any], model: TBCHRL) -> Contender:
-    settings, ratio = model.low_settings, model.gradient_ratio
+    settings, ratio = model.config.low.to_dict(), model.config.gradient_ratio
     flat = kind(
         "MlpPolicy",
         env,
@@ -118,8 +118,8 @@ def _flat(name: str, kind: Any, env: gym.Env[Any, Any], model: TBCHRL) -> Conten
 def warm_up(model: TBCHRL, steps: int) -> None:
     """Learn until both levels do: a level begins to update when its buffer holds a batch."""
     model.learn(max(steps, 1000), reset_num_timesteps=False)
-    batches = [settings["batch_size"] for settings in (model.high_settings, model.low_settings)]
-    while model.num_timesteps <= model.learning_starts or any(
+    batches = [level.batch_size for level in (model.config.high, model.config.low)]
+    while model.num_timesteps <= model.config.learning_starts or any(
         buffer.size() < batch for buffer, batch in zip(model.replay_buffer, batches, strict=True)
     ):
         model.learn(steps, reset_num_timesteps=False)
@@ -188,9 +188,9 @@ def floor(task: str, steps: int, rounds: int, config: str | None = None) -> Resu
     runs = [profile(model, steps) for _ in range(rounds)]
     step = statistics.median(sum(run.values()) for run in runs)
     environment = statistics.median(run["environment"] for run in runs)
-    levels = {"high": model.high_settings["batch_size"], "low": model.low_settings["batch_size"]}
+    levels = {"high": model.config.high.batch_size, "low": model.config.low.batch_size}
     done = {name: products(getattr(model, name), batch, 10 * rounds) for name, batch in levels.items()}
-    rate, ratio = gemm_rate(10 * rounds), model.gradient_ratio
+    rate, ratio = gemm_rate(10 * rounds), model.config.gradient_ratio
     own = ratio * sum(level.microseconds for level in done.values())
     best = ratio * 1e6 * sum(level.flops for level in done.values()) / rate
     figures: Figures = {

@@ -87,7 +87,7 @@ def investigate(
     tables = [features_of(t, space, subgoals, model.rules.dt_max) for t in traces]
     whole = outcome_of([t.episode for t in traces])
     circuit = units if isinstance(units, CircuitUnits) else None
-    remembers = circuit is not None and model.memory != "none"
+    remembers = circuit is not None and model.config.memory != "none"
     plans = plan_lesions(units, traces, n_random=effort.n_random, max_alone=effort.max_alone)
     if remembers:
         wiped = no_lesion(units)._replace(wiped=np.ones(1, dtype=bool))
@@ -100,7 +100,7 @@ def investigate(
         task=task,
         kind="mlp" if circuit is None else "circuit",
         dynamics="" if circuit is None else "dissipative" if dissipative else "conductance",
-        memory=model.memory,
+        memory=model.config.memory,
         units=units,
         traces=traces,
         features=tuple(tables[0]),

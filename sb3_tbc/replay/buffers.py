@@ -26,8 +26,6 @@ Advance = Callable[[Float32, Float32], Float32]
 """Maps low-level observations and memory states to the next states, from the current weights."""
 
 HINDSIGHT_SUBGOALS = ("timed", "future", "episode")
-MISS_SPREAD = 0.7
-"""Standard deviation of a near miss, in thresholds: with six coordinates four of ten are still hits."""
 
 
 class ReachPairs(NamedTuple):
@@ -108,13 +106,8 @@ class SubgoalReplayBuffer(RingBuffer):
     ``"episode"`` (HAC, which has no time): the point reached at a strictly later step of the window, or at any of
     its steps; where fewer than n are there to draw from, the share falls accordingly.
 
-    A point that was reached is always a hit, so that relabelled samples alone never say what a miss is, and the value
-    of any action near a subgoal rises to that of a hit. A share ``near_misses`` of them is moved off the point by a
-    normally distributed distance and rewarded by the subgoal's own test, which shows the edge of a hit.
-
     :param gamma: discount per environment step
     :param n_hindsight_goals: n above, relabelled samples per plain one
-    :param near_misses: share of the relabelled samples whose subgoal is moved off the point that was reached
     :param reward: the low level's reward, by default the sparse one
     :param hindsight: ``"timed"``, ``"future"`` or ``"episode"``
     :param sequence_length: with more than 1, memory states are not the stored ones but recomputed by :attr:`advance`
@@ -135,7 +128,6 @@ class SubgoalReplayBuffer(RingBuffer):
         state_dim: int,
         gamma: float,
         n_hindsight_goals: float,
-        near_misses: float = 0.0,
         device: th.device | str = "cpu",
         seed: int | None = None,
         reward: LowLevelReward | None = None,
@@ -174,7 +166,6 @@ class SubgoalReplayBuffer(RingBuffer):
         self.layout, self.rules, self.gamma = layout, rules, gamma
         self.reward = reward or LowLevelReward("sparse", subgoals, rules)
         self.hindsight, self.n_hindsight_goals, self.sequence_length = hindsight, n_hindsight_goals, sequence_length
-        self.near_misses, self._miss = near_misses, (MISS_SPREAD * subgoals.tolerance).astype(np.float32)
 
     def extend(self, steps: LowLevelSteps) -> None:
         """Add the transitions of an episode, in the order they happened."""
@@ -206,7 +197,7 @@ class SubgoalReplayBuffer(RingBuffer):
         at, where, second = self._timed(at) if self.hindsight == "timed" else self._untimed(at)
         taken = self._take(at)
         subgoal, time_left, rewards, dones = (taken[name] for name in ("subgoal", "time_left", "rewards", "dones"))
-        subgoal[where] = self._missed(self.data["achieved"][second])
+        subgoal[where] = self.data["achieved"][second]
         expired = second == at[where]
         if self.hindsight == "timed":
             ahead = (second - at[where]) % self.buffer_size
@@ -240,13 +231,6 @@ class SubgoalReplayBuffer(RingBuffer):
         at[where] = (begin + first) % self.buffer_size
         return at, where, (begin + second) % self.buffer_size
 
-    def _missed(self, reached: Float32) -> Float32:
-        """Points that were reached, a share of them moved off."""
-        if self.near_misses:
-            moved = np.flatnonzero(self.rng.random(len(reached)) < self.near_misses)
-            reached[moved] += self._miss * self.rng.standard_normal((len(moved), reached.shape[1]), dtype=np.float32)
-        return reached
-
     def _untimed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """The same for goals without time: the rows stay, only their subgoals are drawn."""
         position, length = (self.data[name][at, 0].astype(np.int64) for name in ("position", "length"))
@@ -262,7 +246,7 @@ class SubgoalReplayBuffer(RingBuffer):
         self, here: Float32, achieved: Float32, subgoal: Float32, expired: NDArray[np.bool_]
     ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
         """Rewards and ends of relabelled steps."""
-        if self.reward.kind == "sparse" and self.rules.window_end == "timed" and not self.near_misses:
+        if self.reward.kind == "sparse" and self.rules.window_end == "timed":
             return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
         return self.reward.of(here, achieved, subgoal, expired)
 

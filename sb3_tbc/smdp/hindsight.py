@@ -134,24 +134,6 @@ class HindsightSettings(NamedTuple):
     goals_met: str = "passing"  # when a window meets its hindsight goal: "passing" it, or at its "end" alone
 
 
-class GoalRange:
-    """The box of the goals that episodes have asked for so far.
-
-    :param dim: number of goal coordinates
-    """
-
-    def __init__(self, dim: int) -> None:
-        self.bounds: FloatArray = np.stack([np.full(dim, np.inf), np.full(dim, -np.inf)])  # low, high
-
-    def add(self, goal: FloatArray) -> None:
-        """Widen the box by a goal, ``(goal_dim,)``, task units."""
-        self.bounds = np.stack([np.minimum(self.bounds[0], goal), np.maximum(self.bounds[1], goal)])
-
-    def holds(self, goals: FloatArray) -> NDArray[np.bool_]:
-        """Which of ``goals`` ``(n, goal_dim)`` lie in the box, ``(n,)``."""
-        return np.asarray(((goals >= self.bounds[0]) & (goals <= self.bounds[1])).all(axis=-1))
-
-
 def relabel_actions(
     episode: Episode,
     subgoals: SubgoalSpace,
@@ -233,7 +215,6 @@ def high_level_steps(
     goal_test: GoalTest,
     high_view: Callable[[dict[str, FloatArray]], FloatArray],
     rng: np.random.Generator,
-    asked: GoalRange | None = None,
 ) -> HighLevelSteps:
     """All SMDP transitions that the high level learns from in one episode, in this order:
 
@@ -241,7 +222,6 @@ def high_level_steps(
     copies of these with hindsight goals.
 
     :param high_view: maps goal observations to the high level's flat observation
-    :param asked: hindsight goals outside of it are left out; None keeps all
     """
     n = len(episode.options)
     starts = np.array([option.start for option in episode.options])
@@ -293,8 +273,6 @@ def high_level_steps(
     happened = np.flatnonzero(subgoals.happened(after))
     event = int(happened[0]) if len(happened) else None
     pairs = goal_pairs(n, settings.n_goals, settings.goal_strategy, rng, event)
-    if asked is not None:
-        pairs = pairs[asked.holds(episode.achieved_goal[ends[pairs[:, 1]]])]
     if len(pairs):
         goals = episode.achieved_goal[ends[pairs[:, 1]]]
         at_end = reward.target == "decision" or settings.goals_met == "end"

@@ -1,97 +1,220 @@
-"""The parts of an agent, made from its settings: the two levels, their replay buffers, what hindsight does."""
+"""The parts of an agent, made from its settings: rules, views, rewards, levels, schedules and replay buffers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+import math
+from typing import Any, NamedTuple
 
+import torch as th
 from gymnasium import spaces
 
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.smdp.hindsight import HindsightSettings
-from sb3_tbc.tbc_hrl.config import DEFAULT_WIRING, learning_rate_of
-from sb3_tbc.tbc_hrl.scheduling import DurationTeacher
+from sb3_tbc.smdp.options import OptionRules
+from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
+from sb3_tbc.smdp.spaces import SubgoalSpace
+from sb3_tbc.smdp.views import LevelViews
+from sb3_tbc.tbc_hrl.collection import Exploration
+from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
+from sb3_tbc.tbc_hrl.level_config import learning_rate_of
+from sb3_tbc.tbc_hrl.reachability import Reachability
+from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
 
-if TYPE_CHECKING:
-    from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
+
+class LevelSpaces(NamedTuple):
+    """What a level sees and what it chooses, flat vectors both."""
+
+    observation: spaces.Box
+    action: spaces.Box
 
 
-def make_high_level(model: TBCHRL, observation: spaces.Box, action: spaces.Box, seed: int) -> SACLevel:
-    """The level that chooses subgoals and time budgets.
+# ------------------------------------------------------------------------------- the semi-Markov process
 
-    :param observation: what it sees, :meth:`~sb3_tbc.smdp.views.LevelViews.high_space`
-    :param action: what it chooses, :meth:`~sb3_tbc.smdp.views.LevelViews.high_action_space`
+
+def make_rules(config: TBCConfig, episode_length: int | None) -> OptionRules:
+    """What ends a window.
+
+    :param episode_length: time limit of the task, environment steps; None where it has none
+    :raises ValueError: if ``dt_max`` is to be derived from an episode's length that is not known
     """
-    settings = model.high_settings
-    return _make_level(
-        model, "high", settings, observation, action, settings["policy_kwargs"], seed, model.duration_loss_coef
+    dt_max = config.dt_max
+    if dt_max == -1:
+        if episode_length is None:
+            raise ValueError("dt_max=-1 needs an environment with max_episode_steps; pass dt_max in steps")
+        dt_max = episode_length / config.max_options
+    return OptionRules(dt_max, config.dt_min, config.max_options, config.window_end)
+
+
+def make_views(config: TBCConfig, subgoals: SubgoalSpace, achieved_in_observation: bool) -> LevelViews:
+    """What each level sees and chooses."""
+    chooses_time = config.duration == "joint"
+    return LevelViews(subgoals, achieved_in_observation, config.relative_subgoals, config.remaining_time, chooses_time)
+
+
+def make_high_reward(config: TBCConfig, rules: OptionRules) -> HighLevelReward:
+    """What the high level is rewarded for; a time budget that nobody chooses costs nothing."""
+    return HighLevelReward(
+        target=config.target,
+        gamma=config.high.gamma,
+        dt_ref=rules.dt_ref,
+        dt_max=rules.dt_max,
+        decision_cost=config.decision_cost,
+        duration_cost=0.0 if config.duration == "fixed" else config.duration_cost,
+        completion_bonus=config.completion_bonus,
     )
 
 
-def make_low_level(model: TBCHRL, observation: spaces.Box, action: spaces.Box, seed: int) -> SACLevel:
+def hindsight_settings(config: TBCConfig) -> HindsightSettings:
+    """How episodes are rewritten for the high level."""
+    return HindsightSettings(
+        n_goals=config.n_hindsight_goals,
+        goal_strategy=config.goal_strategy,
+        testing_penalty=config.failed_test_reward,
+        keep_original=config.keep_original,
+        tolerance=config.relabel_tolerance,
+        goals_met=config.goals_met,
+    )
+
+
+def exploration(config: TBCConfig) -> Exploration:
+    """How both levels act while they learn."""
+    return Exploration(config.random_fraction, config.testing_fraction, config.deterministic_testing)
+
+
+# -------------------------------------------------------------------------------------------- time budgets
+
+
+def make_reachability(config: TBCConfig, subgoals: SubgoalSpace, rules: OptionRules, seed: int) -> Reachability | None:
+    """The estimate of steps to a subgoal, where the rule of equation 1 is used or taught; else None."""
+    if config.duration != "rule" and not config.duration_loss_coef:
+        return None
+    horizon = math.ceil(rules.dt_max / max(config.kappa, 0.1))  # what is further away is clipped anyway
+    return Reachability(subgoals, rules.dt_ref, horizon, seed=seed)
+
+
+def make_schedule(
+    config: TBCConfig, views: LevelViews, rules: OptionRules, reachability: Reachability | None
+) -> FixedWindows | ReachRule | None:
+    """Who sets time budgets (paper, section 4.1); None where the high level does."""
+    if config.duration == "fixed":
+        return FixedWindows(rules, rules.dt_max if config.fixed_duration is None else config.fixed_duration)
+    if config.duration == "rule" and reachability is not None:
+        return ReachRule(views, rules, reachability, config.kappa)
+    return None
+
+
+# -------------------------------------------------------------------------------------------------- levels
+
+
+def make_high_level(config: TBCConfig, ends: LevelSpaces, seed: int, device: th.device) -> SACLevel:
+    """The level that chooses subgoals and time budgets."""
+    policy_kwargs = config.high.policy_kwargs.to_kwargs()
+    if policy_kwargs["negative_critic"] is None:
+        policy_kwargs["negative_critic"] = True
+    return _make_level("high", config, config.high, ends, policy_kwargs, seed, device)
+
+
+def make_low_level(config: TBCConfig, ends: LevelSpaces, seed: int, device: th.device, views: LevelViews) -> SACLevel:
     """The level that executes subgoals; its actor is the circuit unless its ``policy_kwargs["ndbc"]`` is None."""
-    policy_kwargs = dict(model.low_settings["policy_kwargs"])
-    default = {**DEFAULT_WIRING, "motor": action.shape[0]} if model.default_circuit else None
-    circuit = policy_kwargs.get("ndbc", default)
-    scale = {"input_scale": model.layout.low_scale().tolist()}
-    policy_kwargs["ndbc"] = None if circuit is None else {**scale, **circuit}
-    policy_kwargs.setdefault("negative_critic", model.low_reward == "step")
-    return _make_level(model, "low", model.low_settings, observation, action, policy_kwargs, seed)
+    policy_kwargs = config.low.policy_kwargs.to_kwargs()
+    circuit = policy_kwargs["ndbc"]
+    if circuit is not None:
+        if circuit["motor"] is None:
+            circuit["motor"] = ends.action.shape[0]
+        if circuit["input_scale"] is None:
+            circuit["input_scale"] = views.low_scale().tolist()
+    if policy_kwargs["negative_critic"] is None:
+        policy_kwargs["negative_critic"] = config.low_reward == "step"
+    return _make_level("low", config, config.low, ends, policy_kwargs, seed, device)
 
 
 def _make_level(
-    model: TBCHRL,
     name: str,
-    settings: Mapping[str, Any],
-    observation: spaces.Box,
-    action: spaces.Box,
-    policy_kwargs: Mapping[str, Any],
+    config: TBCConfig,
+    level: LevelConfig,
+    ends: LevelSpaces,
+    policy_kwargs: dict[str, Any],
     seed: int,
-    label_coef: float = 0.0,
+    device: th.device,
 ) -> SACLevel:
-    gamma, actor_rate = settings["gamma"], settings["actor_learning_rate"]
+    actor_rate = level.actor_learning_rate
     return SACLevel(
-        LevelPolicy, observation, action, None, learning_rate_of(settings["learning_rate"]), gamma, settings["tau"],
-        settings["ent_coef"], settings["target_entropy"], dict(policy_kwargs), seed=seed, device=model.device,
-        compile=model.compile, ent_coef_learning_rate=settings["ent_coef_learning_rate"],
-        actor_learning_rate=None if actor_rate is None else learning_rate_of(actor_rate), name=name,
-        label_coef=label_coef, average_decay=settings["average_decay"],
-    )  # fmt: skip
-
-
-def make_high_buffer(model: TBCHRL, observation: spaces.Box, action: spaces.Box, seed: int) -> OptionReplayBuffer:
-    """Replay of options, with time budgets to learn from where the reachability estimate teaches them."""
-    taught = model.subgoals if model.duration_loss_coef else None
-    buffer = OptionReplayBuffer(
-        model.high_settings["buffer_size"], observation, action, device=model.device, seed=seed, context=taught
+        LevelPolicy,
+        ends.observation,
+        ends.action,
+        learning_rate=learning_rate_of(level.learning_rate),
+        actor_learning_rate=None if actor_rate is None else learning_rate_of(actor_rate),
+        ent_coef_learning_rate=level.ent_coef_learning_rate,
+        gamma=level.gamma,
+        tau=level.tau,
+        ent_coef=level.ent_coef,
+        target_entropy=level.target_entropy,
+        policy_kwargs=policy_kwargs,
+        seed=seed,
+        device=device,
+        compile=config.compile,
+        name=name,
+        label_coef=config.duration_loss_coef if name == "high" else 0.0,
+        average_decay=level.average_decay,
     )
-    if model.duration_loss_coef:
-        buffer.teacher = DurationTeacher(model.rule, model.high)
+
+
+# -------------------------------------------------------------------------------------------------- replay
+
+
+def make_high_buffer(
+    config: TBCConfig,
+    ends: LevelSpaces,
+    seed: int,
+    device: th.device,
+    high: SACLevel,
+    views: LevelViews,
+    rules: OptionRules,
+    reachability: Reachability | None,
+) -> OptionReplayBuffer:
+    """Replay of options, with time budgets to learn from where the reachability estimate teaches them."""
+    taught = reachability is not None and config.duration_loss_coef > 0
+    buffer = OptionReplayBuffer(
+        config.high.buffer_size,
+        ends.observation,
+        ends.action,
+        device=device,
+        seed=seed,
+        context=views.subgoals if taught else None,
+    )
+    if taught and reachability is not None:
+        buffer.teacher = DurationTeacher(ReachRule(views, rules, reachability, config.kappa), high)
     return buffer
 
 
-def make_low_buffer(model: TBCHRL, observation: spaces.Box, action: spaces.Box, seed: int) -> SubgoalReplayBuffer:
+def make_low_buffer(
+    config: TBCConfig,
+    ends: LevelSpaces,
+    seed: int,
+    device: th.device,
+    low: SACLevel,
+    views: LevelViews,
+    reward: LowLevelReward,
+) -> SubgoalReplayBuffer:
     """Replay of the low level's steps, which draws their hindsight subgoals."""
-    settings, untimed = model.low_settings, model.low_reward == "step"
+    own = config.low
     buffer = SubgoalReplayBuffer(
-        settings["buffer_size"], observation, action, layout=model.layout, rules=model.rules,
-        state_dim=model.low.state_dim, gamma=settings["gamma"],
-        n_hindsight_goals=settings.get("n_hindsight_goals", model.n_hindsight_goals),
-        near_misses=settings.get("near_misses", 0.0),
-        device=model.device, seed=seed, reward=model.low_level_reward,
-        hindsight=settings.get("goal_strategy", model.goal_strategy) if untimed else "timed",
-        sequence_length=model.sequence_length, reach_pairs=model.reachability is not None,
-    )  # fmt: skip
-    buffer.advance = model.low.advance
+        own.buffer_size,
+        ends.observation,
+        ends.action,
+        layout=views,
+        rules=reward.rules,
+        state_dim=low.state_dim,
+        gamma=own.gamma,
+        n_hindsight_goals=config.n_hindsight_goals if own.n_hindsight_goals is None else own.n_hindsight_goals,
+        device=device,
+        seed=seed,
+        reward=reward,
+        hindsight=(own.goal_strategy or config.goal_strategy) if config.low_reward == "step" else "timed",
+        sequence_length=config.sequence_length,
+        reach_pairs=config.duration == "rule" or config.duration_loss_coef > 0,
+    )
+    buffer.advance = low.advance
     return buffer
-
-
-def hindsight_settings(model: TBCHRL) -> HindsightSettings:
-    """How episodes are rewritten for the high level; a failed test costs ``max_options`` unless the user says what."""
-    penalty = -float(model.max_options) if model.testing_penalty is None else model.testing_penalty
-    return HindsightSettings(
-        int(model.n_hindsight_goals), model.goal_strategy, penalty, model.keep_original, model.relabel_tolerance,
-        model.goals_met,
-    )  # fmt: skip

@@ -13,7 +13,6 @@ from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep, HierarchicalVecEnv, Proposal, Schedule
 from sb3_tbc.smdp.hindsight import (
-    GoalRange,
     GoalTest,
     HighLevelSteps,
     HindsightSettings,
@@ -159,7 +158,6 @@ class EpisodeStore:
     :param low_reward: the low level's reward
     :param hindsight: how much of it
     :param rng: draws hindsight goals and times
-    :param asked: the goals asked for so far, which limit those of hindsight; None does not limit them
     """
 
     def __init__(
@@ -171,22 +169,17 @@ class EpisodeStore:
         low_reward: LowLevelReward,
         hindsight: HindsightSettings,
         rng: np.random.Generator,
-        asked: GoalRange | None = None,
     ) -> None:
-        self.asked = asked
         self.replay, self.views, self.rules = replay, views, rules
         self.reward, self.low_reward, self.hindsight, self.rng = reward, low_reward, hindsight, rng
 
     def add(self, episode: Episode, goal_test: GoalTest) -> HighLevelSteps:
         """Store an episode; what the high level learns from it."""
         subgoals = self.views.subgoals
-        if self.asked is not None:
-            self.asked.add(episode.desired_goal[0])
         self.replay.low.extend(low_level_steps(episode, subgoals, self.rules, self.low_reward))
         steps = high_level_steps(
-            episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.views.high, self.rng,
-            self.asked,
-        )  # fmt: skip
+            episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.views.high, self.rng
+        )
         self.replay.high.extend(steps)
         return steps
 

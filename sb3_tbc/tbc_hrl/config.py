@@ -1,133 +1,226 @@
-"""Settings of a level: defaults, checks, and what the task itself says."""
+"""Settings of the agents: one field each, with its type, what it may hold, its default, and its help text below it.
+
+Everything else is derived from these classes: the constructor's signature and checks, the keys of configuration files
+and ``--hyperparams``, ``train --help-settings``, the settings page of the documentation, and what a saved agent
+remembers. A new setting is one field here and the code that uses it. Settings of a level are in
+:mod:`sb3_tbc.tbc_hrl.level_config`.
+"""
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
-from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import VecEnv
+from sb3_tbc.settings import Range, SettingError, Settings
+from sb3_tbc.tbc_hrl.level_config import (
+    CircuitConfig,
+    Fraction,
+    HighConfig,
+    LearningRate,
+    LevelConfig,
+    LowConfig,
+    LowPolicyConfig,
+    NetArch,
+    NotNegative,
+    PolicyConfig,
+    Positive,
+    Price,
+    Temperature,
+    UpdateRatio,
+    Width,
+)
 
-from sb3_tbc.level.update import AVERAGE_DECAY
-
-LEVEL_DEFAULTS: dict[str, Any] = {
-    "learning_rate": 2e-3,
-    "actor_learning_rate": None,
-    "ent_coef_learning_rate": None,
-    "average_decay": AVERAGE_DECAY,
-    "batch_size": 256,
-    "gradient_ratio": None,
-    "gamma": 0.99,
-    "tau": 0.0125,
-    "ent_coef": "auto",
-    "target_entropy": "auto",
-    "buffer_size": 1_000_000,
-    "policy_kwargs": {"net_arch": [64, 64], "mean_bound": 3.0, "log_std_bounds": [-6.9, 1.8]},
-}
-"""What a level uses where the user says nothing; the head's bounds are HiTS's (sigma in [1e-3, 6])."""
-
-HIGH_DEFAULTS: dict[str, Any] = {"learning_rate": 3e-3, "ent_coef": 1.0}
-"""Where the high level departs from them: a fixed temperature of the size of a decision's price keeps it exploring."""
-
-CHOICES = {
-    "memory": ("window", "episode", "none"),
-    "duration": ("joint", "rule", "fixed"),
-    "goals_met": ("passing", "end"),
-    "hindsight_goals": ("all", "asked"),
-}
-
-DEFAULT_WIRING = {
-    "inter": 8,
-    "command": 6,
-    "sensory_fanout": 4,
-    "inter_fanout": 5,
-    "recurrent_command_synapses": 3,
-    "motor_fanin": 5,
-}
+__all__ = [
+    "CircuitConfig",
+    "FlatConfig",
+    "HACConfig",
+    "HiTSConfig",
+    "HighConfig",
+    "LevelConfig",
+    "LowConfig",
+    "LowPolicyConfig",
+    "PolicyConfig",
+    "TBCConfig",
+]
 
 
-def learning_rate_of(value: float | str) -> float | LinearSchedule:
-    """A constant learning rate, or ``"lin_<rate>"``: one that falls linearly to zero at the end of training.
+@dataclass(frozen=True, kw_only=True)
+class AgentConfig(Settings):
+    """Settings of an agent of two levels that are not of one level alone."""
 
-    :raises ValueError: if the text is of another form
-    """
-    if not isinstance(value, str):
-        return value
-    try:
-        start = float(value.removeprefix("lin_"))
-    except ValueError:
-        raise ValueError(f"learning_rate must be a number or 'lin_<number>', got {value!r}") from None
-    return LinearSchedule(start, 0.0, 1.0) if value.startswith("lin_") else start
+    max_options: Annotated[int, Range(1, 1_000_000)] = 20
+    """High-level decisions allowed per episode."""
+    window_end: Literal["timed", "reached"] = "timed"
+    """What ends a window: its time budget alone (HiTS), or reaching the subgoal as well (algorithm 1)."""
+    dt_min: NotNegative = 0.0
+    """Shortest time budget, environment steps."""
+    dt_max: Annotated[float, Range(1, also=(-1,))] = -1.0
+    """Longest time budget, environment steps; -1: the episode's length divided by ``max_options``."""
+    duration: Literal["joint", "rule", "fixed"] = "joint"
+    """Who sets the time budget: the high level together with the subgoal, the rule of equation 1
+    (``clip(kappa * H_reach, dt_min, dt_max)``), or nobody: it is always ``fixed_duration``."""
+    fixed_duration: Positive | None = None
+    """Constant time budget for ``duration: fixed``, environment steps; none: ``dt_max``."""
+    kappa: Positive = 1.0
+    """Scales the estimated steps to a subgoal into a time budget (equation 1, table A2)."""
+    duration_loss_coef: Price = 0.0
+    """Weight of the loss that draws the high level's time budget toward the rule's (section 4.2), in unit action
+    coordinates; 0 leaves it out."""
+    remaining_time: bool = True
+    """Whether the low level sees how much of its time budget is left."""
+    target: Literal["smdp", "decision"] = "smdp"
+    """The high level learns rewards of the whole window and a discount per step (paper), or the last reward of
+    the window and a discount per decision (HiTS)."""
+    decision_cost: Price = 1.0
+    """Price of each decision of the high level; with ``target: smdp`` only, HiTS's reward has it built in."""
+    duration_cost: Price = 2.0
+    """Price of the longest time budget; shorter ones cost in proportion."""
+    completion_bonus: Price = 0.0
+    """Added to the high level's reward where an option reaches its subgoal, in hindsight too (section 4.5)."""
+    low_reward: Literal["sparse", "dense", "step"] = "sparse"
+    """The low level's reward: 1 where the window ends with its subgoal reached; the same plus how much nearer each step
+    came; or -1 for each step until the subgoal is reached (HAC)."""
+    testing_fraction: Fraction = 0.3
+    """Share of options that test their subgoal: a failed test is punished."""
+    deterministic_testing: bool = False
+    """Whether the low level acts without noise in a test; the public HiTS does not."""
+    testing_penalty: Annotated[float, Range(-1e6, 0)] | None = None
+    """Reward of a failed test; none: minus ``max_options``."""
+    keep_original: bool = False
+    """Also learn from failed options as they were chosen, besides what hindsight makes of them (algorithm 1)."""
+    relabel_tolerance: NotNegative | None = None
+    """Largest distance, in unit coordinates, between where a failed option ended and the subgoal it is relabelled with
+    (the paper's success test: 0.05); none relabels them all."""
+    random_fraction: Fraction = 0.05
+    """Share of uniformly random actions on each level while exploring."""
+    n_hindsight_goals: Annotated[int, Range(0, 1_000_000)] = 3
+    """Hindsight goals for each transition."""
+    goal_strategy: Literal["future", "episode", "event"] = "future"
+    """Where the high level's hindsight goals come from: later options of the episode, any of its options, or the option
+    that the task's event ended."""
+    goals_met: Literal["passing", "end"] = "passing"
+    """When a window meets a hindsight goal: while passing it, as the episode would have ended there, or at its end
+    alone, as HiTS's target always does."""
+    gradient_ratio: UpdateRatio = 1.0
+    """Updates of each level per environment step, done in bursts after episodes."""
+    learning_starts: Annotated[int, Range(0)] = 0
+    """Environment steps before the first update."""
+    memory: Literal["window", "episode", "none"] = "none"
+    """How long the circuit remembers: until the window ends, until the episode ends, or from no step to the next."""
+    sequence_length: Annotated[int, Range(1, 1000)] = 1
+    """Steps through which the low level's update recomputes its memory; 1 takes the stored one."""
+    relative_subgoals: bool = False
+    """Show the low level the distance to its subgoal instead of the subgoal itself."""
+    compile: bool | Literal["auto"] = "auto"
+    """Compile the updates; ``auto``: where a C++ compiler is found and the run is long enough to gain."""
+
+    def check(self) -> None:
+        """Refuse what cannot be meant together."""
+        if self.dt_max != -1 and self.dt_min >= self.dt_max:
+            raise SettingError("dt_min", f"must be below dt_max={self.dt_max:g}, got {self.dt_min:g}")
+        if self.sequence_length > 1 and self.memory == "none":
+            raise SettingError(
+                "sequence_length",
+                f"of {self.sequence_length} recomputes the low level's memory, but memory='none' keeps none: use "
+                "memory='window' or sequence_length=1",
+            )
+        if self.duration_loss_coef and self.duration != "joint":
+            raise SettingError(
+                "duration_loss_coef",
+                f"of {self.duration_loss_coef} teaches a high level that chooses its time budgets: use "
+                f"duration='joint' (here {self.duration!r}), or 0",
+            )
+        if self.fixed_duration is not None and self.duration != "fixed":
+            raise SettingError(
+                "fixed_duration", f"of {self.fixed_duration:g} needs duration='fixed', got duration={self.duration!r}"
+            )
 
 
-def attribute_of(env: VecEnv, name: str) -> Any:
-    """Attribute of the first task under its wrappers; None where there is none."""
-    try:
-        return env.get_attr(name, indices=[0])[0]
-    except AttributeError:
-        return None
+@dataclass(frozen=True, kw_only=True)
+class TBCConfig(AgentConfig):
+    """All settings of TBC-HRL."""
+
+    high: HighConfig = field(default_factory=HighConfig)
+    """The high level, which chooses subgoals and time budgets."""
+    low: LowConfig = field(default_factory=LowConfig)
+    """The low level, which executes subgoals."""
+
+    def check(self) -> None:
+        """Refuse what cannot be meant together."""
+        super().check()
+        if self.low.goal_strategy is not None and self.low_reward != "step":
+            raise SettingError(
+                "low.goal_strategy",
+                f"{self.low.goal_strategy!r} has an effect with low_reward='step' alone, here it is "
+                f"{self.low_reward!r}: hindsight subgoals that depend on time come from the same window",
+            )
+
+    @property
+    def failed_test_reward(self) -> float:
+        """What a failed test of a subgoal is rewarded with."""
+        return -float(self.max_options) if self.testing_penalty is None else self.testing_penalty
 
 
-def episode_length(env: VecEnv) -> int:
-    """Time limit of the task, environment steps.
-
-    :raises ValueError: if the environment has none
-    """
-    steps = attribute_of(env, "max_episode_steps") or getattr(attribute_of(env, "spec"), "max_episode_steps", None)
-    if steps is None:
-        raise ValueError("dt_max=-1 needs an environment with max_episode_steps; pass dt_max in steps")
-    return int(steps)
+NO_CIRCUIT = LowConfig(policy_kwargs=LowPolicyConfig(ndbc=None))
+"""A low level whose actor is an MLP."""
 
 
-def level_settings(name: str, given: Mapping[str, Any] | None, extra: tuple[str, ...] = ()) -> dict[str, Any]:
-    """A level's settings with defaults filled in.
+@dataclass(frozen=True, kw_only=True)
+class HiTSConfig(TBCConfig):
+    """HiTS: windows run their full time, the reward is per decision, the low level is an MLP."""
 
-    :raises ValueError: on an unknown name, naming the nearest valid one
-    """
-    given = dict(given or {})
-    allowed = [*LEVEL_DEFAULTS, *extra]
-    for key in given:
-        if key not in allowed:
-            near = difflib.get_close_matches(key, allowed, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            raise ValueError(f"unknown setting {name}.{key}{hint} Allowed: {', '.join(sorted(allowed))}")
-    decay = given.get("average_decay", AVERAGE_DECAY)
-    if (given.get("gradient_ratio") or 0) < 0:
-        raise ValueError(f"{name}.gradient_ratio must not be negative, got {given['gradient_ratio']}")
-    if not 0.0 <= given.get("near_misses", 0.0) <= 1.0:
-        raise ValueError(f"{name}.near_misses is a share and must lie in [0, 1], got {given['near_misses']}")
-    if not 0.0 <= decay < 1.0:
-        raise ValueError(f"{name}.average_decay must be at least 0 (no averaging) and less than 1, got {decay}")
-    kwargs = {**LEVEL_DEFAULTS["policy_kwargs"], **given.get("policy_kwargs", {})}
-    if name == "high":
-        kwargs.setdefault("negative_critic", True)
-    role = HIGH_DEFAULTS if name == "high" else {}
-    return {**LEVEL_DEFAULTS, **role, **given, "policy_kwargs": kwargs}
+    target: Literal["smdp", "decision"] = "decision"
+    low: LowConfig = NO_CIRCUIT
 
 
-def check_settings(given: Mapping[str, Any]) -> None:
-    """Refuse an agent's settings that cannot be meant.
+@dataclass(frozen=True, kw_only=True)
+class HACConfig(TBCConfig):
+    """HAC: windows end at their subgoal, time is neither chosen nor seen, the low level is an MLP."""
 
-    :param given: the settings by name
-    :raises ValueError: naming the value, what is allowed and the likely cure
-    """
-    for name, allowed in CHOICES.items():
-        if given[name] not in allowed:
-            raise ValueError(f"{name} must be one of {', '.join(map(repr, allowed))}, got {given[name]!r}")
-    for name in ("testing_fraction", "random_fraction"):
-        if not 0.0 <= given[name] <= 1.0:
-            raise ValueError(f"{name} must lie in [0, 1], got {given[name]}")
-    for name in ("gradient_ratio", "duration_loss_coef"):
-        if given[name] < 0:
-            raise ValueError(f"{name} must not be negative, got {given[name]}")
-    if given["sequence_length"] > 1 and given["memory"] == "none":
-        raise ValueError(
-            f"sequence_length={given['sequence_length']} recomputes the low level's memory, but memory='none' keeps "
-            "none: use memory='window' or sequence_length=1"
-        )
-    if given["duration_loss_coef"] and given["duration"] != "joint":
-        raise ValueError(
-            f"duration_loss_coef={given['duration_loss_coef']} teaches a high level that chooses its time budgets: "
-            f"use duration='joint' (here {given['duration']!r}), or 0"
-        )
+    window_end: Literal["timed", "reached"] = "reached"
+    duration: Literal["joint", "rule", "fixed"] = "fixed"
+    remaining_time: bool = False
+    target: Literal["smdp", "decision"] = "decision"
+    low_reward: Literal["sparse", "dense", "step"] = "step"
+    low: LowConfig = NO_CIRCUIT
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlatPolicyConfig(Settings):
+    """Networks of the flat baseline; names as in Stable-Baselines3's ``policy_kwargs``."""
+
+    net_arch: tuple[Width, ...] | NetArch = (256, 256)
+    """Neurons of each hidden layer, for actor and critics alike, or ``pi`` and ``qf`` where they differ."""
+    n_critics: Annotated[int, Range(1, 100)] = 2
+    """Critics of which the lowest value counts."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlatConfig(Settings):
+    """All settings of flat SAC; names and defaults as in Stable-Baselines3."""
+
+    learning_rate: LearningRate = 3e-4
+    """Learning rate of critics, actor and temperature; ``lin_<rate>`` falls linearly to zero at the end of training."""
+    batch_size: Annotated[int, Range(1, 1_000_000)] = 256
+    """Transitions of each update."""
+    gamma: Fraction = 0.99
+    """Discount per environment step."""
+    tau: Annotated[float, Range(0, 1, above=True)] = 0.005
+    """Polyak factor of the target critics."""
+    ent_coef: Temperature = "auto"
+    """Temperature: a fixed one, ``auto``, or ``auto_<number>`` that starts there."""
+    target_entropy: float | Literal["auto"] = "auto"
+    """Entropy that an automatic temperature aims at; auto: minus the number of action dimensions."""
+    buffer_size: Annotated[int, Range(1, 1_000_000_000)] = 1_000_000
+    """Transitions that the replay buffer holds."""
+    learning_starts: Annotated[int, Range(0)] = 100
+    """Environment steps before the first update, in which actions are uniformly random."""
+    gradient_ratio: UpdateRatio = 1.0
+    """Updates per environment step, done every 100 steps."""
+    n_hindsight_goals: Annotated[int, Range(0, 1_000_000)] = 3
+    """Relabelled samples for each plain one."""
+    goal_strategy: Literal["future", "episode", "event"] = "future"
+    """Where hindsight goals come from: later steps of the episode, any of its steps, or the step of the task's
+    event."""
+    policy_kwargs: FlatPolicyConfig = FlatPolicyConfig()
+    """Networks."""

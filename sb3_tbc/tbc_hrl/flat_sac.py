@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import pathlib
 import warnings
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,7 +18,10 @@ from stable_baselines3.sac.policies import MultiInputPolicy
 
 from sb3_tbc.files import write_arrays
 from sb3_tbc.smdp.hindsight import check_goal_strategy
-from sb3_tbc.tbc_hrl.config import attribute_of
+from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSettings, takes
+from sb3_tbc.tbc_hrl.config import FlatConfig
+from sb3_tbc.tbc_hrl.environment import attribute_of
+from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 
 CYCLE = 100
 """Environment steps between two bursts of updates."""
@@ -73,51 +75,53 @@ class FlatSAC(SAC):
 
     :param policy: ``"MultiInputPolicy"``
     :param env: a goal environment
-    :param gradient_ratio: updates per environment step, done every 100 steps
-    :param n_hindsight_goals: relabelled samples per plain one
-    :param goal_strategy: ``"future"``, ``"episode"`` or ``"final"``, see SB3, or ``"event"``, see the buffer
-    :param kwargs: SAC's own parameters
-    :raises ValueError: if ``gradient_ratio`` is negative, or ``goal_strategy`` ``"event"`` on a task without one
+    :param arguments: settings, see :class:`~sb3_tbc.tbc_hrl.config.FlatConfig`, and Stable-Baselines3's ``seed, device,
+        verbose, tensorboard_log, stats_window_size``
+    :raises ConfigError: on an unknown setting or a value that it cannot have
+    :raises ValueError: if ``goal_strategy`` is ``"event"`` on a task without one
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
-    default_circuit: ClassVar[bool] = False
+    config_class: ClassVar[type[FlatConfig]] = FlatConfig
+    __signature__ = SignatureOfSettings(SB3Arguments)
 
-    def __init__(
-        self,
-        policy: str | type[BasePolicy],
-        env: GymEnv | str,
-        *,
-        gradient_ratio: float = 1.0,
-        n_hindsight_goals: float = 3,
-        goal_strategy: str = "future",
-        policy_kwargs: Mapping[str, Any] | None = None,
-        _init_setup_model: bool = True,
-        **kwargs: Any,
-    ) -> None:
-        if gradient_ratio < 0:
-            raise ValueError(f"gradient_ratio must not be negative, got {gradient_ratio}")
-        self.gradient_ratio = gradient_ratio
-        by_event = goal_strategy == "event"
-        hindsight = {
-            "n_sampled_goal": int(n_hindsight_goals),
-            "goal_selection_strategy": "future" if by_event else goal_strategy,
-            "event_goals": by_event,
-        }
+    @takes(FlatArguments)
+    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str, **arguments: Any) -> None:
+        sb3, settings = SB3Arguments.taken_from(arguments)
+        config = self.config_class.from_dict(settings)
+        self.settings = config.to_dict()
+        self.gradient_ratio = config.gradient_ratio
+        by_event = config.goal_strategy == "event"
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,
+            learning_rate=learning_rate_of(config.learning_rate),
+            batch_size=config.batch_size,
+            gamma=config.gamma,
+            tau=config.tau,
+            ent_coef=config.ent_coef,
+            target_entropy=config.target_entropy,
+            buffer_size=config.buffer_size,
+            learning_starts=config.learning_starts,
             train_freq=(CYCLE, "step"),
-            gradient_steps=max(round(CYCLE * gradient_ratio), 1),
+            gradient_steps=max(round(CYCLE * config.gradient_ratio), 1),
             replay_buffer_class=TerminatingHerReplayBuffer,
-            replay_buffer_kwargs=hindsight,
-            policy_kwargs=dict(policy_kwargs or {}),
+            replay_buffer_kwargs={
+                "n_sampled_goal": config.n_hindsight_goals,
+                "goal_selection_strategy": "future" if by_event else config.goal_strategy,
+                "event_goals": by_event,
+            },
+            policy_kwargs=config.policy_kwargs.to_dict(),
+            stats_window_size=sb3.stats_window_size,
+            tensorboard_log=None if sb3.tensorboard_log is None else str(sb3.tensorboard_log),
+            verbose=sb3.verbose,
+            device=sb3.device,
+            seed=sb3.seed,
             _init_setup_model=False,
-            **kwargs,
         )
         if by_event and self.env is not None:
-            check_goal_strategy(goal_strategy, attribute_of(self.env, "subgoals"))
-        if _init_setup_model:
+            check_goal_strategy(config.goal_strategy, attribute_of(self.env, "subgoals"))
+        if sb3._init_setup_model:
             self._setup_model()
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:

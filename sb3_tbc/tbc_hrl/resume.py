@@ -5,61 +5,77 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import NDBCActor
+from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv, RunningEpisode
 from sb3_tbc.tbc_hrl.collection import Collector
-
-if TYPE_CHECKING:
-    from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
+from sb3_tbc.tbc_hrl.reachability import Reachability
 
 logger = logging.getLogger(__name__)
 Arrays = dict[str, NDArray[Any]]
 
 
-def generators(model: TBCHRL) -> dict[str, np.random.Generator]:
+class LearningState(NamedTuple):
+    """What changes while an agent learns, besides its settings."""
+
+    num_timesteps: int
+    high: SACLevel
+    low: SACLevel
+    replay: Replay
+    policy_rng: np.random.Generator
+    rng: np.random.Generator
+    reachability: Reachability | None
+    diagnostics: EpisodeDiagnostics
+    collector: Collector | None
+
+
+def generators(learning: LearningState) -> dict[str, np.random.Generator]:
     """Every source of randomness that learning draws from."""
     found = {
-        "agent": model.rng,
-        "policy": model.policy.rng,
-        "high.noise": model.high.noise_rng,
-        "low.noise": model.low.noise_rng,
-        "high.replay": model.replay_buffer.high.rng,
-        "low.replay": model.replay_buffer.low.rng,
+        "agent": learning.rng,
+        "policy": learning.policy_rng,
+        "high.noise": learning.high.noise_rng,
+        "low.noise": learning.low.noise_rng,
+        "high.replay": learning.replay.high.rng,
+        "low.replay": learning.replay.low.rng,
     }
-    if model.reachability is not None:
-        found["reachability"] = model.reachability.rng
+    if learning.reachability is not None:
+        found["reachability"] = learning.reachability.rng
     return found
 
 
-def get_state(model: TBCHRL) -> Arrays:
-    """Random streams, counters, live options and running episodes, as plain arrays."""
+def get_state(learning: LearningState) -> Arrays:
+    """Random streams, counters, live options and running episodes, as plain arrays.
+
+    :param learning: what to take them from
+    """
     plain = {
-        "timesteps": int(model.num_timesteps),
-        "generators": {name: rng.bit_generator.state for name, rng in generators(model).items()},
-        "n_updates": [model.high._n_updates, model.low._n_updates],
-        "diagnostics": dict(model.diagnostics.values),
+        "timesteps": int(learning.num_timesteps),
+        "generators": {name: rng.bit_generator.state for name, rng in generators(learning).items()},
+        "n_updates": [learning.high._n_updates, learning.low._n_updates],
+        "diagnostics": dict(learning.diagnostics.values),
     }
     arrays: Arrays = {}
-    actor = model.low.policy.actor
+    actor = learning.low.policy.actor
     if isinstance(actor, NDBCActor):
         plain["circuit"] = {"updates": actor.net.updates, "sub_steps": actor.net.sub_steps}
         arrays["direction"] = actor.net.lipschitz.direction.numpy().copy()
-    if model.store.asked is not None:
-        arrays["asked"] = model.store.asked.bounds
-    if model.collector is not None and isinstance(model.collector.env.venv, GoalVecEnv):
-        running = model.collector.env.venv.running
+    if learning.collector is not None and isinstance(learning.collector.env.venv, GoalVecEnv):
+        running = learning.collector.env.venv.running
         plain["episodes"] = [{"seed": episode.seed, "generator": episode.generator} for episode in running]
         arrays |= {f"actions.{i}": np.array(episode.actions) for i, episode in enumerate(running)}
-        arrays |= {f"collector.{name}": array for name, array in model.collector.get_state().items()}
+        arrays |= {f"collector.{name}": array for name, array in learning.collector.get_state().items()}
     return {**arrays, "plain": np.array(json.dumps(plain))}
 
 
-def set_state(model: TBCHRL, collector: Collector, state: Mapping[str, NDArray[Any]]) -> bool:
+def set_state(learning: LearningState, state: Mapping[str, NDArray[Any]]) -> bool:
     """Go on where :func:`get_state` was taken; False if the state is of another moment, and nothing was changed.
 
     The log says so: weights and replay of different moments make a run that goes on, but not the one that was saved.
@@ -67,27 +83,26 @@ def set_state(model: TBCHRL, collector: Collector, state: Mapping[str, NDArray[A
     episodes, which the log says.
     """
     plain = json.loads(str(state["plain"])) if "plain" in state else {}
-    if plain.get("timesteps") != model.num_timesteps:
+    if plain.get("timesteps") != learning.num_timesteps:
         saved = plain.get("timesteps", "an unknown number of")
         logger.warning(
-            f"the replay buffer was saved after {saved} steps, the agent after {model.num_timesteps}: learning goes on "
-            "with that buffer, but with new episodes and other random numbers than the saved run"
+            f"the replay buffer was saved after {saved} steps, the agent after {learning.num_timesteps}: learning goes "
+            "on with that buffer, but with new episodes and other random numbers than the saved run"
         )
         return False
-    _relive(collector, plain, state)
-    for name, rng in generators(model).items():
+    if learning.collector is not None:
+        _relive(learning.collector, plain, state)
+    for name, rng in generators(learning).items():
         if name in plain["generators"]:
             rng.bit_generator.state = plain["generators"][name]
-    model.high._n_updates, model.low._n_updates = plain["n_updates"]
-    if model.store.asked is not None and "asked" in state:
-        model.store.asked.bounds = state["asked"]
-    model.diagnostics.values.clear()
-    model.diagnostics.values.update(plain["diagnostics"])
-    actor = model.low.policy.actor
+    learning.high._n_updates, learning.low._n_updates = plain["n_updates"]
+    learning.diagnostics.values.clear()
+    learning.diagnostics.values.update(plain["diagnostics"])
+    actor = learning.low.policy.actor
     if isinstance(actor, NDBCActor) and "circuit" in plain:
         actor.net.updates, actor.net.sub_steps = plain["circuit"]["updates"], plain["circuit"]["sub_steps"]
         actor.net.lipschitz.direction.copy_(actor.net.lipschitz.direction.new_tensor(state["direction"]))
-        model.low.refresh()
+        learning.low.refresh()
     return True
 
 

@@ -6,7 +6,6 @@ Nothing here imports Optuna: a space is data, and a trial is whatever has ``sugg
 from __future__ import annotations
 
 import fnmatch
-import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -16,10 +15,9 @@ from typing import Any, Protocol
 import yaml
 
 from sb3_tbc.errors import ConfigError, nearest
-from sb3_tbc.tbc_hrl.config import DEFAULT_WIRING, LEVEL_DEFAULTS
-from sb3_tbc.zoo.algorithms import algorithm
+from sb3_tbc.tbc_hrl.config import CircuitConfig
 from sb3_tbc.zoo.config import RunConfig, merge
-from sb3_tbc.zoo.schema import RUN, SECTION, coerce, validate
+from sb3_tbc.zoo.schema import CONFIG_CLASSES, RUN, coerce, validate
 
 Values = dict[str, Any]
 """Parameter name -> value, as a trial holds it."""
@@ -29,8 +27,6 @@ SCHEDULE = "learning_rate_schedule"
 SCHEDULES = ("constant", "linear")
 FIELDS = ("low", "high", "log", "step", "choices", "keys", "when")
 CIRCUIT = "low.policy_kwargs.ndbc"
-SUB_STEPS = 3
-"""K where a circuit does not say it, as in :class:`~sb3_tbc.ndbc.NDBCNet`."""
 
 
 class Suggests(Protocol):
@@ -130,10 +126,17 @@ def read_key(run: RunConfig, key: str) -> Any:
     for name in rest:
         value = value.get(name) if isinstance(value, Mapping) else None
     if value is None and len(rest) == 1 and first in ("low", "high"):
-        value = run.model.get(rest[0], LEVEL_DEFAULTS.get(rest[0]))
-    if value is None and not rest and first not in run.model:
-        known = inspect.signature(algorithm(run.algo)).parameters
-        value = known[first].default if first in known else None
+        value = run.model.get(rest[0])  # of the agent
+    return _default(run.algo, key) if value is None and not _is_set(run.model, key) else value
+
+
+def _default(algo: str, key: str) -> Any:
+    """An algorithm's default of a dotted key; None where it has no such setting."""
+    if algo not in CONFIG_CLASSES:
+        return None
+    value: Any = CONFIG_CLASSES[algo]().to_dict()
+    for name in key.split("."):
+        value = value.get(name) if isinstance(value, Mapping) else None
     return value
 
 
@@ -259,7 +262,7 @@ def _choice(name: str, keys: tuple[str, ...], choices: Any, when: tuple[str, Any
 
 def _check_keys(parameter: Parameter, value: Any, where: str) -> None:
     if parameter.name != SCHEDULE:
-        validate(nested(parameter.settings(value)), SECTION, where)
+        validate(nested(parameter.settings(value)), None, where)
 
 
 def restrict(
@@ -358,7 +361,7 @@ def apply(space: Space, values: Mapping[str, Any], run: RunConfig) -> RunConfig:
         for key in ("low.learning_rate", "high.learning_rate"):
             rate = _plain(settings.get(key, read_key(run, key)))
             settings[key] = f"lin_{rate!r}" if values[SCHEDULE] == "linear" else rate
-    change = validate(nested(settings), SECTION, "trial")
+    change = validate(nested(settings), run.algo, "trial")
     in_run = {key: change.pop(key) for key in RUN if key in change}
     if "env_kwargs" in in_run:
         in_run["env_kwargs"] = merge(run.env_kwargs, in_run["env_kwargs"])
@@ -372,11 +375,8 @@ def complete(run: RunConfig, action_dim: int) -> RunConfig:
 
     :param action_dim: size of the task's actions, which is the default number of motor neurons
     """
-    low = run.model.get("low") or {}
-    policy_kwargs = low.get("policy_kwargs") or {}
-    has_default = getattr(algorithm(run.algo), "default_circuit", False)
-    circuit = policy_kwargs.get("ndbc", {}) if has_default else policy_kwargs.get("ndbc")
+    circuit = read_key(run, CIRCUIT)
     if circuit is None:
         return run
-    written = {**DEFAULT_WIRING, "motor": action_dim, "sub_steps": SUB_STEPS, **circuit}
+    written = CircuitConfig.from_dict({**circuit, "motor": circuit.get("motor") or action_dim}).to_dict()
     return replace(run, model=merge(run.model, {"low": {"policy_kwargs": {"ndbc": written}}}))

@@ -46,6 +46,10 @@ def build_model(run: RunConfig, env: VecEnv, seed: int, **options: Any) -> Agent
         return algorithm(run.algo)(policy, env, seed=seed, **settings, **options)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{run.algo} on {run.task}: {error}") from error
+    except (MemoryError, OverflowError) as error:
+        raise ConfigError(
+            f"{run.algo} on {run.task} does not fit into memory ({error}); a smaller buffer_size usually cures it"
+        ) from error
 
 
 def read_zip(path: Path) -> dict[str, Any]:
@@ -91,9 +95,10 @@ def algorithm_of(path: Path, data: dict[str, Any]) -> str:
         return str(name)
     origin = policy.get("__module__") if isinstance(policy, dict) else None
     if name is None and str(origin).startswith("sb3_tbc.tbc_hrl"):  # saved by model.save, without the runner
-        if data.get("low_reward") == HAC.default_low_reward:
+        settings = data.get("settings", data)  # version 0.1.0 kept them among its other attributes
+        if settings.get("low_reward") == "step":
             return "hac"
-        return "hits" if data.get("target") == HiTS.default_target else "tbc-hrl"
+        return "hits" if settings.get("target") == "decision" else "tbc-hrl"
     raise ConfigError(
         f"{path} holds an agent of another algorithm ({name or origin or 'unknown'}), not of {', '.join(ALGORITHMS)}"
     )

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 
 from sb3_tbc.errors import ConfigError, nearest
-from sb3_tbc.zoo.schema import RUN, SECTION, coerce, validate
+from sb3_tbc.zoo.schema import RUN, coerce, validate
 
 CONFIGS = ("paper", "tuned")
 ABLATIONS: dict[str, dict[str, Any]] = {
@@ -86,9 +86,10 @@ def config_file(algo: str) -> Path:
     return path
 
 
-def read_file(path: Path) -> dict[str, dict[str, Any]]:
+def read_file(path: Path, algo: str | None = None) -> dict[str, dict[str, Any]]:
     """Read a configuration file and check all its sections.
 
+    :param algo: algorithm whose settings they are; None allows those of any
     :raises ConfigError: if it cannot be read or holds an unknown key or a wrong value
     """
     try:
@@ -97,12 +98,21 @@ def read_file(path: Path) -> dict[str, dict[str, Any]]:
         raise ConfigError(f"cannot read configuration {path}: {error}") from error
     if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
         raise ConfigError(f"{path}: expected sections of keys (default and one per task)")
-    schema = {**SECTION, "tuned": SECTION}
-    return {name: validate(coerce(section), schema, f"{path.name}, section {name}") for name, section in data.items()}
+    return {name: _checked(coerce(section), algo, f"{path.name}, section {name}") for name, section in data.items()}
+
+
+def _checked(section: dict[str, Any], algo: str | None, where: str) -> dict[str, Any]:
+    """A section and the ``tuned`` one inside of it."""
+    plain = {key: value for key, value in section.items() if key != "tuned"}
+    tuned = section.get("tuned")
+    checked = validate(plain, algo, where)
+    return checked if tuned is None else {**checked, "tuned": validate(tuned, algo, f"{where}, tuned")}
 
 
 def parse_overrides(items: Sequence[str]) -> dict[str, Any]:
     """Command-line settings: ``["low.learning_rate:1e-3"]`` gives ``{"low": {"learning_rate": 0.001}}``.
+
+    Whether the algorithm has such a setting is checked by :func:`load_config`, which knows the algorithm.
 
     :raises ConfigError: for a malformed item, an unknown key or a value of the wrong kind
     """
@@ -120,7 +130,7 @@ def parse_overrides(items: Sequence[str]) -> dict[str, Any]:
         for key in reversed(name.split(".")):
             value = {key: value}
         result = merge(result, value)
-    return validate(coerce(result), SECTION, "--hyperparams")
+    return validate(coerce(result), None, "--hyperparams")
 
 
 def load_config(
@@ -142,7 +152,7 @@ def load_config(
     :raises ConfigError: for unknown names and wrong values
     """
     path = path or config_file(algo)
-    sections = read_file(path)
+    sections = read_file(path, algo)
     default, section = dict(sections.get("default", {})), dict(sections.get(task, {}))
     tuned = merge(default.pop("tuned", {}), section.pop("tuned", {}))
     config = config or ("tuned" if tuned else "paper")
@@ -153,7 +163,8 @@ def load_config(
     if ablation is not None and algo != "tbc-hrl":
         raise ConfigError(f"ablations are of tbc-hrl, there is none of {algo!r}")
     merged = merge(default, section)
-    for change in (tuned if config == "tuned" else {}, ABLATIONS.get(ablation or "", {}), overrides or {}):
+    given = validate(overrides or {}, algo, f"--hyperparams for {algo}")
+    for change in (tuned if config == "tuned" else {}, ABLATIONS.get(ablation or "", {}), given):
         merged = merge(merged, change)
     subgoals = merged.pop("subgoals", None)
     if subgoals:  # belongs to the environment, and stays with it in a saved agent
@@ -164,6 +175,4 @@ def load_config(
             f"neither section {task} nor section default of {path} says n_timesteps; a file of your own takes the "
             "place of the shipped one, so start from a copy of that"
         )
-    if run["n_timesteps"] <= 0 or run.get("n_envs", 1) <= 0:
-        raise ConfigError(f"n_timesteps and n_envs must be positive, got {run}")
     return RunConfig(algo=algo, task=task, config=config, model=merged, **run)

@@ -16,7 +16,6 @@ from stable_baselines3.common.logger import KVWriter
 
 from sb3_tbc.errors import DivergedError
 from sb3_tbc.tbc_hrl import TBCHRL
-from sb3_tbc.tbc_hrl.resume import get_state
 
 DIVERGED = 1e12
 """Critic loss beyond all sense: values of a million, where returns are of the order of 10 to 1000."""
@@ -97,7 +96,7 @@ class ConsistentState(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         if isinstance(self.model, TBCHRL):
-            self._arrays = {name: np.array(array) for name, array in get_state(self.model).items()}
+            self._arrays = {name: np.array(array) for name, array in self.model.learning_state().items()}
             self._attributes = {n: deepcopy(getattr(self.model, n)) for n in self.ATTRIBUTES if hasattr(self.model, n)}
 
     def _on_rollout_end(self) -> None:

@@ -36,12 +36,12 @@ def episode_frames(model: Agent, env: gym.Env[Any, Any], seed: int | None = None
         action, carried = model.predict(observation, state, start, deterministic=True)
         if isinstance(model, TBCHRL) and carried is not None:
             live = TwoLevelState(*carried)
-            if live.used[0] > model.max_options:
+            if live.used[0] > model.config.max_options:
                 result = "action budget used up"
                 break
             if overlay is not None:
                 left = model.rules.remaining(live.time_budget - live.elapsed + 1)
-                overlay(live.subgoal[0], float(left[0]), f"option {live.used[0]} of {model.max_options}")
+                overlay(live.subgoal[0], float(left[0]), f"option {live.used[0]} of {model.config.max_options}")
         yield _frame(env)
         observation, _, terminated, truncated, info = env.step(action)
         state, start = carried, np.array([False])

@@ -132,5 +132,5 @@ def test_mistakes() -> None:
         make(Corridor(), goal_strategy="event")
     with pytest.raises(ValueError, match="this task names none"):
         FlatSAC("MultiInputPolicy", Corridor(), goal_strategy="event")
-    with pytest.raises(ValueError, match=r"one of future, episode, event, got 'final'"):
+    with pytest.raises(ValueError, match=r"one of 'future', 'episode', 'event', got 'final'"):
         make(Corridor(), goal_strategy="final")

@@ -10,7 +10,6 @@ from corridor import Corridor
 
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.smdp.hindsight import (
-    GoalRange,
     GoalTest,
     HindsightSettings,
     check_goal_strategy,
@@ -139,26 +138,6 @@ def test_all_high_level_transitions_by_hand() -> None:
     np.testing.assert_allclose(steps.discounts, 0.9)
 
 
-@pytest.mark.parametrize(("asked", "copies"), [([0.4, 0.6], 1), ([0.5], 1), ([0.6, 0.9], 0), ([], 0)])
-def test_hindsight_goals_can_be_kept_within_those_asked_for(asked: list[float], copies: int) -> None:
-    reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=2.0)
-    settings = HindsightSettings(n_goals=1, goal_strategy="future", testing_penalty=-5.0, keep_original=False)
-    goals = GoalRange(1)
-    for goal in asked:
-        goals.add(np.array([goal]))
-    rng = np.random.default_rng(0)
-    steps = high_level_steps(episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, rng, goals)
-    assert len(steps.rewards) == 3 + copies  # the copy's goal is where the second option ended, 0.5
-
-
-def test_a_range_of_goals_is_a_box() -> None:
-    goals = GoalRange(2)
-    goals.add(np.array([0.0, 1.0]))
-    goals.add(np.array([1.0, -1.0]))
-    outside_or_in = np.array([[0.5, 0.0], [1.0, 1.0], [1.1, 0.0], [0.5, -1.1]])
-    assert goals.holds(outside_or_in).tolist() == [True, True, False, False]
-
-
 def test_ordered_pairs_are_uniform() -> None:
     rng = np.random.default_rng(0)
     first, second = ordered_pairs(np.full(60_000, 3), rng)
@@ -185,21 +164,6 @@ def test_relabelled_low_level_samples_are_consistent() -> None:
     assert ((left > ahead - 1) & (left <= ahead)).all()
     np.testing.assert_array_equal(rewards, ahead == 1)
     np.testing.assert_array_equal(batch.dones[0, :, 0].numpy(), rewards)
-
-
-def test_near_misses_are_judged_by_the_subgoals_own_test() -> None:
-    buffer = low_buffer(100, hindsight=1e9, near_misses=0.8)
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
-    batch = buffer.sample_burst(1, 8000)
-    after, subgoal = batch.next_observations[0, :, 0].numpy(), batch.observations[0, :, 3].numpy()
-    rewards, over = batch.rewards[0, :, 0].numpy() > 0, batch.dones[0, :, 0].numpy() > 0
-    expired = batch.next_observations[0, :, 4].numpy() == 0  # no time left after the step
-    np.testing.assert_array_equal(over, expired)
-    np.testing.assert_array_equal(rewards, expired & (np.abs(after - subgoal) < ENV.subgoals.thresholds[0]))
-    hits = rewards[expired].mean()
-    assert hits == pytest.approx(0.2 + 0.8 * 0.847, abs=0.03)  # a normal distribution within 1 / 0.7 deviations
-    moved = np.abs(np.rint(subgoal / 0.1) * 0.1 - subgoal) > 1e-5
-    assert moved.mean() == pytest.approx(0.8, abs=0.03)
 
 
 def test_plain_low_level_samples_are_what_was_stored() -> None:

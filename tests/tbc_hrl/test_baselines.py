@@ -109,5 +109,5 @@ def test_flat_replay_resumes_from_plain_arrays(tmp_path: Path) -> None:
 
 
 def test_flat_mistakes() -> None:
-    with pytest.raises(ValueError, match="gradient_ratio must not be negative"):
+    with pytest.raises(ValueError, match="gradient_ratio must be a number from 0 to"):
         make_flat(gradient_ratio=-1)

@@ -206,7 +206,9 @@ def test_teacher_labels_are_the_rule_for_the_subgoals_of_the_mean(monkeypatch: p
     seen = [Corridor().reset(seed=s)[0] for s in range(3)]
     batch = {key: np.stack([o[key] for o in seen]) for key in seen[0]}
     here = batch["achieved_goal"]
-    labels = DurationTeacher(model.rule, model.high)(model.layout.high(batch), batch["observation"], here)
+    labels = DurationTeacher(model.replay_buffer.high.teacher.rule, model.high)(
+        model.layout.high(batch), batch["observation"], here
+    )
     _, state = model.predict(batch, deterministic=True)  # before any update the average is the actor
     assert state is not None
     expected = np.clip(0.8 * reach_time(here, state[0]), 0.0, 9.0)

@@ -62,8 +62,6 @@ def contents(model):
         buffer = getattr(model.replay_buffer, name)
         found |= {f"{name}.replay.{key}": array[: buffer.size()] for key, array in buffer.data.items()}
     found["episodes"] = np.array([[info["r"], info["l"]] for info in model.ep_info_buffer])
-    if model.store.asked is not None:
-        found["asked"] = model.store.asked.bounds
     return found
 
 
@@ -103,10 +101,6 @@ def test_with_running_episodes_and_memory(n_envs, window_end, tmp_path):
 
 def test_with_all_that_has_randomness_of_its_own(tmp_path):
     check("Pendulum", tmp_path, 2, 1500, 4000, duration_loss_coef=0.1, memory="window", sequence_length=3)
-
-
-def test_with_the_range_of_goals_asked_for(tmp_path):
-    check("UR5Reacher", tmp_path, hindsight_goals="asked")
 
 
 def test_states_of_another_moment_are_left_alone(tmp_path, caplog):

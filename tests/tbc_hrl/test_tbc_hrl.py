@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -290,15 +292,54 @@ def test_learns_the_corridor() -> None:
     assert evaluate_hierarchical(model, Corridor(), 40, seed=1).success_rate >= 0.9
 
 
-def test_agents_saved_before_a_setting_existed_load(tmp_path: Path) -> None:
-    model = make()
-    for settings in (model.high_settings, model.low_settings):
-        for name in ("average_decay", "gradient_ratio", "actor_learning_rate"):
-            del settings[name]
+def as_version_0_1_0(path: Path, **others: Any) -> Path:
+    """A saved agent as the first version wrote it: settings among its other attributes, and not all of today's."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    data = json.loads(members["data"])
+    settings, _ = data.pop("settings"), data.pop("episode_length")
+    for name in ("high", "low"):
+        level = settings.pop(name)
+        for added in ("average_decay", "gradient_ratio", "actor_learning_rate"):
+            del level[added]
+        data[f"{name}_settings"] = level
+    data |= {**settings, "dt_max": 10.0, **others}
+    former = path.with_name("former.zip")
+    with zipfile.ZipFile(former, "w") as archive:
+        for name, content in {**members, "data": json.dumps(data).encode()}.items():
+            archive.writestr(name, content)
+    return former
+
+
+def test_agents_saved_by_the_first_version_load(tmp_path: Path) -> None:
+    model = make(memory="window", max_options=5)
     model.save(tmp_path / "old")
-    loaded = type(model).load(tmp_path / "old")
+    loaded = TBCHRL.load(as_version_0_1_0(tmp_path / "old.zip", hindsight_goals="all"))
     assert loaded.low_settings["average_decay"] == loaded.low.average_decay == 0.999
     assert loaded.high_settings["gradient_ratio"] is None
+    assert (loaded.config.memory, loaded.rules.max_options, loaded.rules.dt_max) == ("window", 5, 10.0)
+    assert same(parameters(model), parameters(loaded))
+
+
+def test_retired_settings_of_saved_agents_are_told_once(tmp_path: Path) -> None:
+    make().save(tmp_path / "old")
+    with pytest.warns(UserWarning, match="hindsight_goals='asked', a setting that there is no longer") as told:
+        TBCHRL.load(as_version_0_1_0(tmp_path / "old.zip", hindsight_goals="asked"))
+    assert len(told) == 1
+
+
+def test_load_changes_settings_or_refuses(tmp_path: Path) -> None:
+    make(max_options=5).save(tmp_path / "model")
+    loaded = TBCHRL.load(tmp_path / "model", max_options=10, low={"learning_rate": 1e-5}, high={"gamma": 0.5})
+    assert loaded.rules.dt_max == 5.0  # of an episode of 50 steps
+    assert loaded.low.lr_schedule(1.0) == 1e-5
+    assert (loaded.high.gamma, loaded.low.gamma) == (0.5, 0.99)
+    assert loaded.config.low.batch_size == LEVEL["batch_size"]
+    for change in ({"learning_rate": 0.5}, {"gamma": 0.5}, {"custom_objects": {"learning_rate": 0.5}}):
+        with pytest.raises(ValueError, match="use low="):
+            TBCHRL.load(tmp_path / "model", **change)
+    with pytest.raises(TypeError):
+        loaded.low_settings["learning_rate"] = 1e-3  # type: ignore[index]
 
 
 def test_a_level_may_have_a_gradient_ratio_of_its_own() -> None:
@@ -307,7 +348,7 @@ def test_a_level_may_have_a_gradient_ratio_of_its_own() -> None:
     steps = model.num_timesteps
     assert 0.3 * steps < model.low._n_updates <= 0.5 * steps
     assert 0.04 * steps < model.high._n_updates <= 0.1 * steps
-    with pytest.raises(ValueError, match=r"high.gradient_ratio must not be negative, got -1"):
+    with pytest.raises(ValueError, match=r"high.gradient_ratio must be a number from 0 to 1,000 or none, got -1"):
         make(high={"gradient_ratio": -1})
 
 

@@ -1,0 +1,130 @@
+"""What the agents' constructors take: their settings, and what every Stable-Baselines3 algorithm takes.
+
+The classes ending in ``Arguments`` are for the reader's tools alone: :func:`takes` gives a constructor their fields as
+its keyword arguments, so that type checkers and editors know every name and type. :class:`SignatureOfSettings` does the
+same for ``help()`` and :func:`inspect.signature`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+import os
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar
+
+import torch as th
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_tbc.settings import Range, SettingError, Settings, default_of, hints
+from sb3_tbc.smdp.spaces import SubgoalSpace
+from sb3_tbc.tbc_hrl.config import AgentConfig, FlatConfig, HighConfig, LowConfig
+
+P = ParamSpec("P")
+SelfArguments = TypeVar("SelfArguments", bound="SB3Arguments")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SB3Arguments(Settings):
+    """What Stable-Baselines3 asks of an algorithm besides its settings."""
+
+    stats_window_size: Annotated[int, Range(1)] = 100
+    """Episodes that logged means run over."""
+    tensorboard_log: str | os.PathLike[str] | None = None
+    """Folder for TensorBoard's files; none writes none."""
+    verbose: Annotated[int, Range(0, 2)] = 0
+    """How much is printed: nothing, what happens, everything."""
+    device: str | th.device = "cpu"
+    """Torch device: ``cpu``, ``cuda``, ``cuda:0``, ..., or ``auto``."""
+    seed: Annotated[int, Range(0, 2**32 - 1)] | None = None
+    """Seed of networks, sampling and environments; none: a new one for each agent."""
+    _init_setup_model: bool = True
+    """Whether to build the networks now."""
+
+    def check(self) -> None:
+        """Refuse a device that is not there."""
+        check_device(self.device)
+
+    @classmethod
+    def taken_from(cls: type[SelfArguments], arguments: Mapping[str, Any]) -> tuple[SelfArguments, dict[str, Any]]:
+        """Stable-Baselines3's arguments among all, checked, and the others as they are."""
+        own = {name: value for name, value in arguments.items() if name in hints(cls)}
+        others = {name: value for name, value in arguments.items() if name not in own}
+        return cls.from_dict(own), others
+
+
+def check_device(device: str | th.device) -> None:
+    """See that torch knows a device and has it.
+
+    :raises SettingError: naming the devices there are
+    """
+    if device == "auto":
+        return
+    try:
+        kind = th.device(device).type
+    except RuntimeError:
+        raise SettingError("device", f"must be 'auto', 'cpu', 'cuda' or 'cuda:<number>', got {device!r}") from None
+    if kind == "cuda" and not th.cuda.is_available():
+        raise SettingError(
+            "device", f"{str(device)!r} needs a GPU, and torch finds none on this machine; use device='cpu'"
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class HierarchyArguments(SB3Arguments):
+    """What an agent of two levels is told besides."""
+
+    subgoals: SubgoalSpace | None = None
+    """Subgoal space, for environments that do not bring one."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class TBCArguments(AgentConfig, HierarchyArguments):
+    """Keyword arguments of :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`."""
+
+    high: HighConfig | Mapping[str, Any] | None = None
+    low: LowConfig | Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlatArguments(FlatConfig, SB3Arguments):
+    """Keyword arguments of :class:`~sb3_tbc.tbc_hrl.flat_sac.FlatSAC`."""
+
+
+def takes(
+    arguments: Callable[P, Settings],
+) -> Callable[
+    [Callable[..., None]],
+    Callable[Concatenate[Any, str | type[BasePolicy], GymEnv | str | None, P], None],
+]:
+    """Tell type checkers that a constructor takes ``policy``, ``env`` and the fields of ``arguments`` by name."""
+    return lambda constructor: constructor
+
+
+class SignatureOfSettings:
+    """The signature of a class as its ``config_class`` says: for ``help()``, notebooks and the documentation.
+
+    :param others: what the class takes besides its settings
+    """
+
+    def __init__(self, others: type[SB3Arguments]) -> None:
+        self.others = others
+
+    def __get__(self, instance: object, owner: type[Any]) -> inspect.Signature:
+        """The owner's signature."""
+        parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("policy", "env")]
+        for section in (owner.config_class, self.others):
+            types = typing.get_type_hints(section)
+            parameters += [_parameter(field, types[field.name]) for field in dataclasses.fields(section)]
+        return inspect.Signature([parameter for parameter in parameters if not parameter.name.startswith("_")])
+
+
+def _parameter(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
+    """A field as a keyword argument; a section may be given as a mapping, and its default is "as it is"."""
+    default = default_of(field)
+    if isinstance(default, Settings):
+        kind, default = kind | Mapping[str, Any] | None, None
+    return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)

@@ -1,0 +1,79 @@
+"""Settings out of an agent's attributes: as saved now, as saved by version 0.1.0, and as ``load(...)`` changes them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+from sb3_tbc.settings import SettingError, Settings, hints, section_of
+
+FORMER_NAMES = {"high_settings": "high", "low_settings": "low"}
+"""Attributes of version 0.1.0 and the sections that they have become."""
+
+RETIRED: dict[str, tuple[Any, ...]] = {"hindsight_goals": ("all",), "low.near_misses": (0, None)}
+"""Settings that there are no longer, and the values under which leaving them out changes nothing."""
+
+LEVEL_NAMES = ("actor_learning_rate", "batch_size", "buffer_size", "ent_coef", "gamma", "policy_kwargs", "tau",
+               "target_entropy", "average_decay", "ent_coef_learning_rate", "learning_rate")  # fmt: skip
+"""What Stable-Baselines3 takes at the top and an agent of two levels for each of them."""
+
+
+def check_top_names(given: Mapping[str, Any]) -> None:
+    """Refuse a setting of a level where none is named.
+
+    :raises SettingError: naming where it belongs
+    """
+    for name in LEVEL_NAMES:
+        if name in given:
+            raise SettingError(
+                name,
+                f"belongs to a level, and there are two: use low={{{name!r}: ...}} and high={{{name!r}: ...}} "
+                f"in place of {name}={given[name]!r}",
+            )
+
+
+def take_settings(attributes: dict[str, Any], config_class: type[Settings]) -> dict[str, Any]:
+    """Settings found among an agent's attributes, which are removed there.
+
+    :param attributes: ``settings`` as :meth:`to_dict` gave them, and single ones by name, which replace them
+    :param config_class: the agent's settings
+    :raises SettingError: if a setting of a level stands among the agent's
+    """
+    changed = {name: value for name, value in _unset(attributes).items() if name in LEVEL_NAMES}
+    check_top_names(changed)
+    settings: dict[str, Any] = dict(attributes.pop("settings", {}))
+    for former, name in FORMER_NAMES.items():
+        if former in attributes:
+            settings[name] = attributes.pop(former)
+    for name, hint in hints(config_class).items():
+        if name not in attributes:
+            continue
+        value = attributes[name]
+        if section_of(hint) is None:
+            settings[name] = attributes.pop(name)
+        elif isinstance(value, Mapping):  # else it is the level itself
+            settings[name] = {**settings.get(name, {}), **attributes.pop(name)}
+    _drop_retired(settings, attributes)
+    return settings
+
+
+def _unset(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes without what Stable-Baselines3 itself keeps under a level's name."""
+    own = {"learning_rate": 0.0, "policy_kwargs": {}}
+    return {name: value for name, value in attributes.items() if name not in own or value != own[name]}
+
+
+def _drop_retired(settings: dict[str, Any], attributes: dict[str, Any]) -> None:
+    for name, harmless in RETIRED.items():
+        section, _, key = name.rpartition(".")
+        holder = settings.get(section) if section else attributes
+        if not isinstance(holder, dict) or key not in holder:
+            continue
+        value = holder.pop(key)
+        if value not in harmless:
+            warnings.warn(
+                f"the agent was trained with {name}={value!r}, a setting that there is no longer: it acts as before, "
+                "but goes on learning without it",
+                stacklevel=2,
+            )

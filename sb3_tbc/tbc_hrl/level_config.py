@@ -1,0 +1,186 @@
+"""Settings of one level: SAC's own under Stable-Baselines3's names, those of its networks, and those of the circuit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+from stable_baselines3.common.utils import LinearSchedule
+from torch import nn
+
+from sb3_tbc.level.update import AVERAGE_DECAY
+from sb3_tbc.ndbc.stepping import StepRule
+from sb3_tbc.settings import Increasing, Prefixed, Range, SettingError, Settings
+
+Fraction = Annotated[float, Range(0, 1)]
+Positive = Annotated[float, Range(0, above=True)]
+NotNegative = Annotated[float, Range(0)]
+Price = Annotated[float, Range(0, 1e6)]
+LearningRate = Positive | Annotated[str, Prefixed("lin_", Range(0, above=True))]
+Temperature = NotNegative | Literal["auto"] | Annotated[str, Prefixed("auto_", Range(0, above=True))]
+UpdateRatio = Annotated[float, Range(0, 1000)]
+Neurons = Annotated[int, Range(1, 1024)]
+Fan = Annotated[int, Range(1, 4096)]
+Width = Annotated[int, Range(1, 16384)]
+
+
+def learning_rate_of(value: float | str) -> float | LinearSchedule:
+    """A constant learning rate, or ``"lin_<rate>"``: one that falls linearly to zero at the end of training."""
+    return LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0) if isinstance(value, str) else value
+
+
+ACTIVATION_NAMES: dict[str, type[nn.Module]] = {"relu": nn.ReLU, "tanh": nn.Tanh, "silu": nn.SiLU, "elu": nn.ELU}
+"""Activation functions that a level can act with, see :data:`sb3_tbc.level.acting.ACTIVATIONS`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetArch(Settings):
+    """Hidden layers of actor and critics where they differ."""
+
+    pi: tuple[Width, ...] = (64, 64)
+    """Neurons of the actor's hidden layers, input side first."""
+    qf: tuple[Width, ...] = (64, 64)
+    """Neurons of each critic's hidden layers, input side first."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class PolicyConfig(Settings):
+    """Networks of a level; names as in Stable-Baselines3's ``policy_kwargs``."""
+
+    net_arch: tuple[Width, ...] | NetArch = (64, 64)
+    """Neurons of each hidden layer, for actor and critics alike, or ``pi`` and ``qf`` where they differ."""
+    activation_fn: Literal["relu", "tanh", "silu", "elu"] | type[nn.Module] = "relu"
+    """Activation of the hidden layers, by name; in Python the torch class is taken as well."""
+    n_critics: Annotated[int, Range(1, 100)] = 2
+    """Critics of which the lowest value counts."""
+    negative_critic: bool | None = None
+    """Keep the critics' values below zero (HiTS's force_negative), for rewards that are never positive; none: on the
+    high level yes, on the low level where ``low_reward`` is ``step``."""
+    mean_bound: Positive | None = 3.0
+    """The actor's mean is clamped to plus or minus this before squashing, as in HiTS; none does not clamp it."""
+    log_std_bounds: Annotated[tuple[float, float], Increasing()] = (-6.9, 1.8)
+    """Bounds of the logarithm of the actor's standard deviation; the default is HiTS's 0.001 to 6."""
+
+    def __post_init__(self) -> None:
+        """Name the activation function, so that settings stay plain data."""
+        if isinstance(self.activation_fn, type):
+            names = {activation: name for name, activation in ACTIVATION_NAMES.items()}
+            if self.activation_fn not in names:
+                allowed = ", ".join(map(repr, ACTIVATION_NAMES))
+                raise SettingError("activation_fn", f"must be one of {allowed}, got {self.activation_fn!r}")
+            object.__setattr__(self, "activation_fn", names[self.activation_fn])
+        super().__post_init__()
+
+    def to_kwargs(self) -> dict[str, Any]:
+        """As keyword arguments of :class:`~sb3_tbc.level.policies.LevelPolicy`."""
+        return {**self.to_dict(), "activation_fn": ACTIVATION_NAMES[str(self.activation_fn)]}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CircuitConfig(Settings):
+    """NDBCNet, the low level's actor: who is wired to whom (table A1), and how potentials move (section 4.3)."""
+
+    inter: Neurons = 8
+    """Inter neurons."""
+    command: Neurons = 6
+    """Command neurons."""
+    motor: Neurons | None = None
+    """Motor neurons; none: one for each dimension of the action."""
+    sensory_fanout: Fan = 4
+    """Inter neurons that each sensory neuron projects to; at most all of them."""
+    inter_fanout: Fan = 5
+    """Command neurons that each inter neuron projects to."""
+    recurrent_command_synapses: Annotated[int, Range(0, 1_000_000)] = 3
+    """Synapses among the command neurons, in all."""
+    motor_fanin: Fan = 5
+    """Command neurons that each motor neuron listens to."""
+    seed: Annotated[int, Range(0, 2**32 - 1)] = 0
+    """Seed of the wiring."""
+    sub_steps: Annotated[int, Range(1, 64)] = 3
+    """Sub-steps of each control step, K; three synapses lie between sensory and motor neurons."""
+    dynamics: Literal["conductance", "dissipative"] = "conductance"
+    """Neuron model: membrane potentials with conductances, or the dissipative cell of equations 20 and 21."""
+    synapses: Literal["paper", "lean"] = "paper"
+    """Synapse model: a conductance and a reversal potential each, or one parameter each, with inputs acting through the
+    input current alone."""
+    sensory_to: tuple[Literal["inter", "command", "motor"], ...] = ("inter",)
+    """Layers that sensory neurons project to; a second and third one add reflexes, which skip layers."""
+    input_scale: tuple[Positive, ...] | None = None
+    """Fixed scales that inputs are divided by, one for each; none: those of the task."""
+    readout: Literal["all", "motor"] = "all"
+    """Neurons that actions are read from: all of them, as in the paper's equation, or the motor neurons."""
+    max_rho: Annotated[float, Range(0, 1, above=True)] | None = None
+    """Largest contraction factor of the dissipative cell, kept during training; none leaves it free."""
+    adaptive_step: bool | StepRule = False
+    """Choose the number of sub-steps by the step-size rule (equation 17): yes, or some of the rule's own settings."""
+
+    def check(self) -> None:
+        """Refuse what cannot be meant together."""
+        if self.sensory_to != ("inter", "command", "motor")[: len(self.sensory_to)] or not self.sensory_to:
+            raise SettingError(
+                "sensory_to", f"must name layers in order, beginning with 'inter', got {list(self.sensory_to)}"
+            )
+        if self.synapses == "lean" and self.dynamics != "conductance":
+            raise SettingError("synapses", f"'lean' needs dynamics='conductance', got dynamics={self.dynamics!r}")
+        if self.max_rho is not None and self.dynamics != "dissipative":
+            raise SettingError("max_rho", f"needs dynamics='dissipative', got dynamics={self.dynamics!r}")
+
+
+@dataclass(frozen=True, kw_only=True)
+class LowPolicyConfig(PolicyConfig):
+    """Networks of the low level."""
+
+    ndbc: CircuitConfig | None = CircuitConfig()
+    """The circuit that acts; null takes an MLP in its place."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LevelConfig(Settings):
+    """What both levels have; names as in Stable-Baselines3's SAC."""
+
+    learning_rate: LearningRate = 2e-3
+    """Learning rate of critics, actor and temperature; ``lin_<rate>`` falls linearly to zero at the end of training."""
+    actor_learning_rate: LearningRate | None = None
+    """Learning rate of the actor where it differs; circuits take larger steps than critics."""
+    ent_coef_learning_rate: Positive | None = None
+    """Learning rate of the automatic temperature where it differs."""
+    average_decay: Annotated[float, Range(0, 1, below=True)] = AVERAGE_DECAY
+    """Decay per update of the averaged actor, which acts where deterministic actions are asked for; 0: no average."""
+    batch_size: Annotated[int, Range(1, 1_000_000)] = 256
+    """Transitions of each update."""
+    gradient_ratio: UpdateRatio | None = None
+    """Updates per environment step where they differ from the agent's ``gradient_ratio``."""
+    gamma: Fraction = 0.99
+    """Discount: of the high level per decision, of the low level per environment step."""
+    tau: Annotated[float, Range(0, 1, above=True)] = 0.0125
+    """Polyak factor of the target critics."""
+    ent_coef: Temperature = "auto"
+    """Temperature: a fixed one, ``auto``, or ``auto_<number>`` that starts there."""
+    target_entropy: float | Literal["auto"] = "auto"
+    """Entropy that an automatic temperature aims at; auto: minus the number of action dimensions."""
+    buffer_size: Annotated[int, Range(1, 1_000_000_000)] = 1_000_000
+    """Transitions that the replay buffer holds."""
+    policy_kwargs: PolicyConfig = PolicyConfig()
+    """Networks of the level."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HighConfig(LevelConfig):
+    """The high level, which chooses subgoals and time budgets."""
+
+    learning_rate: LearningRate = 3e-3
+    """Learning rate of critics, actor and temperature; ``lin_<rate>`` falls linearly to zero at the end of training."""
+    ent_coef: Temperature = 1.0
+    """Temperature, as on the low level; the default, the size of a decision's price, keeps the level exploring."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LowConfig(LevelConfig):
+    """The low level, which executes subgoals."""
+
+    n_hindsight_goals: Annotated[float, Range(0, 1e6)] | None = None
+    """Hindsight subgoals for each transition, where not the agent's ``n_hindsight_goals``; may be a fraction."""
+    goal_strategy: Literal["future", "episode"] | None = None
+    """Where hindsight subgoals come from if not as the agent's ``goal_strategy`` says; ``low_reward: step`` only."""
+    policy_kwargs: LowPolicyConfig = LowPolicyConfig()
+    """Networks of the level; the circuit among them."""
