@@ -1,52 +1,37 @@
-"""``python -m sb3_tbc.reproduce``: the paper's campaign, runs side by side, resumable, into the results ledger."""
+"""``python -m sb3_tbc.reproduce``: the paper's experiments, on this machine, as jobs of Slurm, or on a Ray cluster.
+
+Results go to the ledger. A stopped campaign is continued by the same command: finished runs are never repeated; failed
+ones are recorded in the ledger, counted, and tried again.
+"""
 
 from __future__ import annotations
 
-import os
-import subprocess
+import argparse
 import sys
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command
+import yaml
+
+from sb3_tbc.campaign.campaign import Campaign
+from sb3_tbc.campaign.executors import Executor, LocalExecutor, RayExecutor, SlurmExecutor
+from sb3_tbc.campaign.hours import measured_speeds, plan
+from sb3_tbc.campaign.jobs import Job
+from sb3_tbc.campaign.progress import Board
+from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.train import variant_name
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
 from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env, task_names
 from sb3_tbc.zoo.ledger import RunFolder
 
-
-@dataclass(frozen=True)
-class Job:
-    """One run of the campaign and the folders it goes to."""
-
-    algo: str
-    env: str
-    seed: int
-    folder: RunFolder
-    target: RunFolder
-    arguments: tuple[str, ...]
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return f"{self.env} {self.algo} {self.folder.path.parent.name} seed {self.seed}"
-
-    def command(self) -> list[str]:
-        """The training command that begins this run, or goes on where it stopped."""
-        train = [sys.executable, "-m", "sb3_tbc.train", "--no-progress"]
-        if self.folder.resumable:
-            return [*train, "--resume", str(self.folder.path)]
-        return [*train, "--overwrite", *self.arguments]
-
-
 EXAMPLES = {
     "sb3_tbc.reproduce --dry-run": "what would run, and how many hours it takes",
     "sb3_tbc.reproduce --tasks Pendulum --seeds 3 --workers 2": "three seeds of every method, two runs at a time",
     "sb3_tbc.reproduce --algos tbc-hrl --ablation no-ts --first-seed 100": "an ablation, on fresh seeds",
+    "sb3_tbc.reproduce --executor slurm --workers 40 --slurm slurm_partition:short": "as jobs of Slurm",
+    "sb3_tbc.reproduce --executor ray --workers 40 --address auto": "on the Ray cluster that this machine belongs to",
 }
 
 
@@ -68,15 +53,19 @@ def build_parser() -> Parser:
     add("--n-final-episodes", type=positive_int, default=100, help="episodes of the evaluation after training")
     add = parser.add_argument_group("how they are run").add_argument
     add("--workers", type=positive_int, default=1, help="runs at the same time, one thread each")
-    add("--executor", choices=["local"], default="local", help="where they run")
-    add("--dry-run", action="store_true", help="print what would be run, and stop")
+    add("--executor", choices=["local", "slurm", "ray"], default="local", help="local: processes on this machine; "
+        "slurm, ray: a cluster whose machines all see the folders below (extra cluster)")  # fmt: skip
+    add("--slurm", nargs="+", default=[], metavar="NAME:VALUE", help="settings of the Slurm jobs, as submitit names "
+        "them, e.g. slurm_partition:short timeout_min:600")  # fmt: skip
+    add("--address", help="of the Ray cluster; by default that of RAY_ADDRESS, or a new one on this machine")
+    add("--dry-run", action="store_true", help="print what would be run and how long it takes, and stop")
     add("--log-folder", type=Path, default=Path("runs"), help="folder of the runs")
     add("--ledger", type=Path, default=Path("results"), help="folder that the small result files are copied to")
     return parser
 
 
 def jobs(argv: Sequence[str]) -> Iterator[Job]:
-    """The runs of a campaign, seeds innermost last, so that every task and method has a first seed early.
+    """The runs of a campaign, seeds in the outer loop, so that every task and method has a first seed early.
 
     :raises ConfigError: for unknown names, before anything runs
     """
@@ -85,61 +74,41 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         for name in args.tasks:
             task, _ = resolve_env(name)
-            for algo in args.algos:
+            for algo in (name.lower() for name in args.algos):
                 algorithm(algo)
-                load_config(algo, task, args.config, overrides, args.ablation)  # mistakes are told before anything runs
+                run = load_config(algo, task, args.config, overrides, args.ablation)
                 variant = args.variant or variant_name(args.ablation, args.config)
-                arguments = ["--algo", algo, "--env", name, "--seed", str(seed), "--variant", variant]
-                arguments += ["--log-folder", str(args.log_folder), "--n-final-episodes", str(args.n_final_episodes)]
-                for flag, value in (("--config", args.config), ("--n-timesteps", args.n_timesteps)):
-                    arguments += [flag, str(value)] if value else []
-                arguments += ["--ablation", args.ablation] if args.ablation else []
-                for flag, value in (("--eval-freq", args.eval_freq), ("--n-eval-episodes", args.n_eval_episodes)):
-                    arguments += [flag, str(value)] if value else []
-                arguments += ["--hyperparams", *args.hyperparams] if args.hyperparams else []
-                folder, target = (RunFolder.of(r, task, algo, variant, seed) for r in (args.log_folder, args.ledger))
-                yield Job(algo, name, seed, folder, target, tuple(arguments))
+                arguments = ["--algo", algo, "--env", name, "--seed", str(seed), "--variant", variant, *_shared(args)]
+                folder, target = (
+                    RunFolder.of(root.absolute(), task, algo, variant, seed) for root in (args.log_folder, args.ledger)
+                )
+                yield Job(algo, name, seed, folder, target, tuple(arguments), args.n_timesteps or run.n_timesteps)
 
 
-class Campaign:
-    """Carries out jobs with a number of workers; stopping it stops the runs, which save themselves."""
+def _shared(args: argparse.Namespace) -> list[str]:
+    """Arguments of the training command that are the same for all runs."""
+    shared = ["--log-folder", str(args.log_folder), "--n-final-episodes", str(args.n_final_episodes)]
+    names = ("config", "n_timesteps", "ablation", "eval_freq", "n_eval_episodes")
+    for name, value in ((name, getattr(args, name)) for name in names):
+        shared += [f"--{name.replace('_', '-')}", str(value)] if value else []
+    return [*shared, "--hyperparams", *args.hyperparams] if args.hyperparams else shared
 
-    def __init__(self) -> None:
-        self._running: set[subprocess.Popen[bytes]] = set()
-        self._stopped = threading.Event()
 
-    def run(self, todo: Sequence[Job], workers: int) -> list[Job]:
-        """Run jobs; returns those that failed."""
-        with ThreadPoolExecutor(workers) as pool:
-            try:
-                outcome = list(pool.map(self._run_one, todo))
-            except KeyboardInterrupt:
-                self._stopped.set()
-                for process in tuple(self._running):
-                    process.terminate()
-                raise
-        return [job for job, good in zip(todo, outcome, strict=True) if not good]
+def make_executor(args: argparse.Namespace) -> Executor:
+    """Where the runs are carried out.
 
-    def _run_one(self, job: Job) -> bool:
-        if self._stopped.is_set():
-            return False
-        if not job.folder.finished:
-            job.folder.path.mkdir(parents=True, exist_ok=True)
-            log = job.folder.path / "train.log"
-            print(f"begin   {job.name}   (log: {log})", flush=True)
-            with log.open("ab") as output:
-                environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-                process = subprocess.Popen(job.command(), stdout=output, stderr=output, env=environment)
-                self._running.add(process)
-                status = process.wait()
-                self._running.discard(process)
-            if status != 0:
-                print(f"failed  {job.name}   (exit status {status}, see {log})", flush=True)
-                return False
-        job.folder.copy_to(job.target)
-        final = job.target.read_final()
-        print(f"done    {job.name}   success {final['success_rate']:.2f} at {final['n_timesteps']:,} steps", flush=True)
-        return True
+    :raises ConfigError: without the package that is needed, or for a malformed setting
+    """
+    if args.executor == "slurm":
+        return SlurmExecutor(args.log_folder.absolute() / "slurm", _slurm_settings(args.slurm))
+    return RayExecutor(args.address) if args.executor == "ray" else LocalExecutor()
+
+
+def _slurm_settings(items: Sequence[str]) -> dict[str, object]:
+    pairs = [item.partition(":") for item in items]
+    if wrong := [item for item, (name, colon, _) in zip(items, pairs, strict=True) if not name or not colon]:
+        raise ConfigError(f"--slurm takes name:value, e.g. timeout_min:600; got {wrong[0]!r}")
+    return {name: yaml.safe_load(value) for name, _, value in pairs}
 
 
 def command(argv: Sequence[str]) -> int:
@@ -149,13 +118,22 @@ def command(argv: Sequence[str]) -> int:
     todo = [job for job in campaign if not job.target.finished]
     print(f"{len(campaign)} runs, {len(campaign) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
     if args.dry_run:
-        print("\n".join(f"to do   {job.name}" for job in todo))
+        print("\n".join(plan(todo, args.workers, measured_speeds(args.ledger), lambda job: job.name)))
         return 0
+    if not todo:
+        return 0
+    stop_like_ctrl_c()
+    executor = make_executor(args)
     try:
-        failed = Campaign().run(todo, args.workers)
+        with Board(len(todo)) as board:
+            failed = Campaign(executor, args.workers, board).run(todo)
     except KeyboardInterrupt:
         print("stopped; the same command continues", file=sys.stderr)
         return INTERRUPTED
+    finally:
+        executor.close()
+    if failed:
+        print(f"{len(failed)} of {len(todo)} runs failed; the same command tries them again", file=sys.stderr)
     return 1 if failed else 0
 
 

@@ -21,7 +21,7 @@ LAYERS = (
     ("level",),
     ("tbc_hrl",),
     ("zoo",),
-    ("pretrained",),
+    ("pretrained", "campaign"),
     ("train", "evaluate", "report"),
     ("tune", "export", "reproduce"),
     ("benchmark", "interpret"),

@@ -1,0 +1,74 @@
+"""One run of a campaign: its folders, its command, and what is kept of it when it fails."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from sb3_tbc.files import write_atomic
+from sb3_tbc.zoo.ledger import RunFolder, to_json
+
+FAILED = "failed.json"
+"""In the ledger's folder of a run that ended in an error: when it was tried, how often, and what it said last."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of the campaign and the folders it goes to.
+
+    :param algo: algorithm
+    :param env: task or environment id, as it was asked for
+    :param seed: training seed
+    :param folder: where the run is carried out
+    :param target: its place in the ledger
+    :param arguments: for ``python -m sb3_tbc.train``
+    :param n_timesteps: environment steps of the run
+    :param cwd: working directory of the command; folders in ``arguments`` are relative to it
+    """
+
+    algo: str
+    env: str
+    seed: int
+    folder: RunFolder
+    target: RunFolder
+    arguments: tuple[str, ...]
+    n_timesteps: int = 0
+    cwd: Path = field(default_factory=Path.cwd)
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return f"{self.env} {self.algo} {self.folder.path.parent.name} seed {self.seed}"
+
+    @property
+    def log(self) -> Path:
+        """Where the run's output goes."""
+        return self.folder.path / "train.log"
+
+    def command(self) -> list[str]:
+        """The training command that begins this run, or continues it where it stopped."""
+        train = [sys.executable, "-m", "sb3_tbc.train", "--no-progress"]
+        if self.folder.resumable:
+            return [*train, "--resume", str(self.folder.path)]
+        return [*train, "--overwrite", *self.arguments]
+
+    def keep_result(self) -> None:
+        """Copy the result into the ledger and forget earlier failures."""
+        self.folder.copy_to(self.target)
+        (self.target.path / FAILED).unlink(missing_ok=True)
+
+    def keep_failure(self, status: int) -> str:
+        """Record in the ledger that the run failed, and count how often it did.
+
+        :param status: exit status of the training command
+        :return: the last line it wrote
+        """
+        record = self.target.path / FAILED
+        attempts = json.loads(record.read_text(encoding="utf-8"))["attempts"] if record.is_file() else 0
+        text = self.log.read_text(encoding="utf-8", errors="replace").strip() if self.log.is_file() else ""
+        last = text.splitlines()[-1] if text else ""
+        row = {"task": self.env, "algo": self.algo, "variant": self.folder.path.parent.name, "seed": self.seed}
+        write_atomic(record, to_json({**row, "exit_status": status, "attempts": attempts + 1, "message": last}))
+        return last
