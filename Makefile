@@ -11,7 +11,7 @@ SEED ?= 0
 STEPS ?= $(if $(filter Pendulum,$(ENV)),100000,)
 RUN := runs/$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: help install train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks bench report pretrained clean
+.PHONY: help install browser train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks bench report pretrained clean
 
 help:
 	@echo "install          .venv with the package (editable) and what its tests need"
@@ -27,7 +27,6 @@ help:
 # The stamp is newer than the files that decide what is installed: nothing is done twice.
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	@scripts/system-packages.sh
-	@scripts/browser.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --editable '.[tests]' --constraint constraints.txt
 	@touch $@
@@ -40,7 +39,10 @@ train: install
 	-$(BIN)/python -m sb3_tbc.evaluate $(RUN)/*/*/*/*/model.zip --n-episodes 3 --video $(RUN)/episodes.mp4
 	$(BIN)/python -m sb3_tbc.report $(RUN) --html $(RUN)/report.html
 
-test: install pytest
+test: install browser pytest
+
+browser:
+	@scripts/browser.sh
 
 pytest:
 	$(BIN)/python -m pytest

@@ -13,13 +13,14 @@ from sb3_tbc.commands import Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.evaluate import identify
 from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.interpret.drawing import picture_of
 from sb3_tbc.interpret.episodes import FIRST_SEED, HeldOutEpisodes
 from sb3_tbc.interpret.features import space_of
 from sb3_tbc.interpret.findings import Effort, Findings, investigate, to_plain
 from sb3_tbc.interpret.page import live_page
 from sb3_tbc.interpret.picture import activation_in_space, units_shown
 from sb3_tbc.interpret.text import describe
-from sb3_tbc.interpret.units import units_of
+from sb3_tbc.interpret.units import CircuitUnits, units_of
 from sb3_tbc.pretrained import model_path
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.algorithms import load_two_levels
@@ -45,6 +46,8 @@ def build_parser() -> Parser:
     parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first episode")
     parser.add_argument("--json", type=Path, metavar="OUT.json", help="write every figure")
     parser.add_argument("--png", type=Path, metavar="OUT.png", help="draw activation in space, as the paper's figure 5")
+    parser.add_argument("--wiring", type=Path, metavar="OUT.png", help="draw the circuit: its readout, dead ends, and "
+                        "synapses as thick as they are used")  # fmt: skip
     parser.add_argument("--html", type=Path, metavar="OUT.html", help="write a page in which the circuit runs, in one "
                         "file")  # fmt: skip
     parser.add_argument("--n-random", type=positive_int, default=5, help="random lesions of each size")
@@ -63,8 +66,9 @@ def command(argv: Sequence[str]) -> int:
     info = identify(args.model, args.env)
     model = load_two_levels(args.model, device=args.device)
     units, space = units_of(model), space_of(info["task"], model.layout.subgoals)
-    if args.synapses and not hasattr(units, "synapses"):
-        raise ConfigError("--synapses cuts the synapses of a circuit; this agent's low level is an MLP")
+    if not isinstance(units, CircuitUnits) and (args.synapses or args.wiring):
+        asked = "--synapses" if args.synapses else "--wiring"
+        raise ConfigError(f"{asked} is about the synapses of a circuit; this agent's low level is an MLP")
     episodes = HeldOutEpisodes(model, info["env_id"], info["env_kwargs"], args.n_episodes, args.seed)
     try:
         effort = Effort(args.n_random, args.max_alone, args.synapses)
@@ -83,6 +87,9 @@ def _write(args: Any, found: Findings, model: TBCHRL, info: dict[str, Any], epis
     if args.json is not None:
         about = {**identity, "n_timesteps": int(model.num_timesteps), "first_episode_seed": args.seed}
         write_atomic(args.json, to_json(to_plain(found, about)))
+    if args.wiring is not None and isinstance(found.units, CircuitUnits):
+        circuit = picture_of(model, info["task"], found.units, found.traces)
+        save_atomic(lambda path: Path(path).write_bytes(circuit), args.wiring)
     if args.png is None and args.html is None:
         return
     which = units_shown(found.units, found.activity)

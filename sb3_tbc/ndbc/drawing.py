@@ -1,4 +1,8 @@
-"""A wiring as a picture: layers from left to right, excitatory synapses red, inhibitory blue. Needs matplotlib."""
+"""A wiring as a picture: layers from left to right, excitatory synapses red, inhibitory blue. Needs matplotlib.
+
+What cannot act on any output is drawn hollow: a dead end. With weights of a readout, outputs are a fifth column; with
+currents of a trained agent, synapses are as thick and as dark as they are used.
+"""
 
 from __future__ import annotations
 
@@ -7,56 +11,120 @@ from typing import Any
 
 import numpy as np
 
+from sb3_tbc.arrays import BoolArray, FloatArray
 from sb3_tbc.extras import require
 from sb3_tbc.ndbc.wiring import LAYERS, NDBCWiring
 
 COLOURS = {"sensory": "#4d9221", "inter": "#7b7b7b", "command": "#c27ba0", "motor": "#e08214"}
 EXCITATORY, INHIBITORY = "#c0392b", "#2c5aa0"
+OUTPUT, DEAD = "#444444", "#999999"
 
 
-def draw_wiring(wiring: NDBCWiring, ax: Any = None, input_names: Sequence[str] | None = None) -> Any:
-    """Draw neurons and signed synapses.
+def draw_wiring(
+    wiring: NDBCWiring,
+    ax: Any = None,
+    input_names: Sequence[str] | None = None,
+    *,
+    readout: FloatArray | None = None,
+    output_names: Sequence[str] | None = None,
+    used: tuple[FloatArray, FloatArray] | None = None,
+) -> Any:
+    """Draw neurons, signed synapses and, where they are known, the readout's weights and how much each synapse is used.
 
     :param wiring: the wiring
     :param ax: matplotlib axes to draw into; new ones by default
     :param input_names: a name per sensory neuron
+    :param readout: weight of each neuron on each output, ``(n_neurons, n_outputs)``; without it the motor neurons count
+        as what is read
+    :param output_names: a name per output
+    :param used: mean size of the current through each synapse, from sensory neurons ``(n_inputs, n_neurons)`` and among
+        neurons ``(n_neurons, n_neurons)``; all synapses look alike without it
     :return: the axes
-    :raises ValueError: if there are not as many names as inputs
+    :raises ValueError: if a name or a weight is missing
     :raises MissingExtraError: without matplotlib
     """
-    if input_names is not None and len(input_names) != wiring.n_inputs:
-        raise ValueError(f"need {wiring.n_inputs} input names, got {len(input_names)}")
+    _check_names("input", input_names, wiring.n_inputs)
+    if readout is not None and len(readout) != wiring.n_neurons:
+        raise ValueError(f"readout needs a row for each of {wiring.n_neurons} neurons, got {len(readout)}")
+    n_outputs = 0 if readout is None else readout.shape[1]
+    _check_names("output", output_names, n_outputs)
     if ax is None:
         pyplot = require("matplotlib.pyplot", extra="plots", what="drawing a wiring")
         _, ax = pyplot.subplots(figsize=(7.0, 4.0))  # constrained layout takes minutes over so many arrows
-    places = _places(wiring)
-    sensory, neurons = places[: wiring.n_inputs], places[wiring.n_inputs :]
-    for sources, signs in ((sensory, wiring.sensory), (neurons, wiring.recurrent)):
+    places = _places(wiring, n_outputs)
+    ends = wiring.n_inputs + wiring.n_neurons
+    sensory, neurons, outputs = places[: wiring.n_inputs], places[wiring.n_inputs : ends], places[ends:]
+    for k, (sources, signs) in enumerate(((sensory, wiring.sensory), (neurons, wiring.recurrent))):
+        share = None if used is None else _shares(used[k])
         for i, j in np.argwhere(signs):
-            _synapse(ax, sources[i], neurons[j], EXCITATORY if signs[i, j] > 0 else INHIBITORY)
-    sizes = {"sensory": wiring.n_inputs, **{name: getattr(wiring, name) for name in LAYERS}}
-    start = 0
-    for column, (name, size) in enumerate(sizes.items()):
-        x, y = places[start : start + size].T
-        ax.scatter(x, y, s=110, color=COLOURS[name], edgecolor="white", linewidth=1.0, zorder=3)
-        ax.text(column, 1.08, f"{name} ({size})", ha="center", va="bottom", fontsize=9, color=COLOURS[name])
-        start += size
+            _synapse(ax, sources[i], neurons[j], signs[i, j] > 0, 0.5 if share is None else float(share[i, j]))
+    if readout is not None:
+        for i, j in np.argwhere(readout):
+            _synapse(ax, neurons[i], outputs[j], readout[i, j] > 0, float(_shares(readout)[i, j]))
+    _draw_neurons(ax, wiring, places, dead_ends(wiring, readout), n_outputs)
     for name, (x, y) in zip(input_names or (), sensory, strict=False):
         ax.text(x - 0.08, y, name, ha="right", va="center", fontsize=7)
-    ax.set(xlim=(-0.6, 3.4), ylim=(-0.08, 1.2))
+    for name, (x, y) in zip(output_names or (), outputs, strict=False):
+        ax.text(x + 0.08, y, name, ha="left", va="center", fontsize=7)
+    ax.set(xlim=(-0.6, 3.4 + (n_outputs > 0)), ylim=(-0.08, 1.2))
     ax.axis("off")
     return ax
 
 
-def _places(wiring: NDBCWiring) -> Any:
-    """Coordinates of all neurons, sensory ones first: one column per layer, evenly spread."""
-    sizes = (wiring.n_inputs, wiring.inter, wiring.command, wiring.motor)
-    columns = [np.stack([np.full(n, c), 1.0 - (np.arange(n) + 0.5) / n], axis=1) for c, n in enumerate(sizes)]
+def dead_ends(wiring: NDBCWiring, readout: FloatArray | None = None) -> tuple[BoolArray, BoolArray]:
+    """Sensory neurons ``(n_inputs,)`` and neurons ``(n_neurons,)`` that cannot act on any output.
+
+    :param readout: weights ``(n_neurons, n_outputs)``; without them the motor neurons are what is read
+    """
+    acts = np.zeros(wiring.n_neurons, dtype=bool)
+    if readout is None:
+        acts[wiring.layer("motor")] = True
+    else:
+        acts |= (np.asarray(readout) != 0).any(axis=1)
+    heard = wiring.recurrent != 0
+    for _ in range(wiring.n_neurons):
+        acts |= heard[:, acts].any(axis=1)
+    return ~(wiring.sensory[:, acts] != 0).any(axis=1), ~acts
+
+
+def _check_names(what: str, names: Sequence[str] | None, size: int) -> None:
+    if names is not None and len(names) != size:
+        raise ValueError(f"need {size} {what} names, got {len(names)}")
+
+
+def _shares(weights: FloatArray) -> FloatArray:
+    size = np.abs(np.asarray(weights, dtype=np.float64))
+    return np.asarray(size / max(float(size.max(initial=0.0)), 1e-12))
+
+
+def _draw_neurons(ax: Any, wiring: NDBCWiring, places: Any, dead: tuple[BoolArray, BoolArray], n_outputs: int) -> None:
+    sizes = {"sensory": wiring.n_inputs, **{name: getattr(wiring, name) for name in LAYERS}}
+    sizes.update({"output": n_outputs} if n_outputs else {})
+    ended, start = np.concatenate([*dead, np.zeros(n_outputs, dtype=bool)]), 0
+    for column, (name, size) in enumerate(sizes.items()):
+        colour, part = COLOURS.get(name, OUTPUT), slice(start, start + size)
+        for which, filled in ((~ended[part], True), (ended[part], False)):
+            x, y = places[part][which].T
+            look = {"color": colour, "edgecolor": "white"} if filled else {"color": "white", "edgecolor": DEAD}
+            ax.scatter(x, y, s=110, linewidth=1.0, linestyle="-" if filled else "--", zorder=3, **look)
+        ax.text(column, 1.08, f"{name} ({size})", ha="center", va="bottom", fontsize=9, color=colour)
+        start += size
+    if ended.any():
+        ax.text(1.5, -0.06, f"hollow: {int(ended.sum())} dead ends, which act on no output", ha="center", fontsize=7)
+
+
+def _places(wiring: NDBCWiring, n_outputs: int) -> Any:
+    """Coordinates of all neurons, sensory ones first, then of the outputs: one column per layer, evenly spread."""
+    sizes = (wiring.n_inputs, wiring.inter, wiring.command, wiring.motor, n_outputs)
+    columns = [np.stack([np.full(n, c), 1.0 - (np.arange(n) + 0.5) / n], axis=1) for c, n in enumerate(sizes) if n]
     return np.concatenate(columns)
 
 
-def _synapse(ax: Any, source: Any, target: Any, colour: str) -> None:
-    """A line between layers; an arc, bending to the right, within one."""
+def _synapse(ax: Any, source: Any, target: Any, excites: bool, share: float) -> None:
+    """A line between layers, an arc, bending to the right, within one; ``share`` of the thickest, 0 to 1."""
     bend = 0.0 if source[0] != target[0] else 0.6 * np.sign(source[1] - target[1] or 1.0)
-    style = {"arrowstyle": "-|>", "color": colour, "alpha": 0.55, "lw": 0.8, "shrinkA": 5, "shrinkB": 6}
+    style = {
+        "arrowstyle": "-|>", "color": EXCITATORY if excites else INHIBITORY, "alpha": 0.08 + 0.85 * share,
+        "lw": 0.3 + 1.1 * share, "shrinkA": 5, "shrinkB": 6,
+    }  # fmt: skip
     ax.annotate("", target, source, arrowprops={**style, "connectionstyle": f"arc3,rad={bend}", "mutation_scale": 6})

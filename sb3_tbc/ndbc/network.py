@@ -6,10 +6,12 @@ from collections.abc import Mapping, Sequence
 from numbers import Integral
 from typing import Any
 
+import numpy as np
 import torch as th
 from torch import nn
 from torch.nn import functional
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.ndbc.cell import Cell, ConductanceCell
 from sb3_tbc.ndbc.dissipative import Certificate, DissipativeCell
 from sb3_tbc.ndbc.lean import LeanCell
@@ -250,14 +252,21 @@ class NDBCNet(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._restore_step = None if chosen is None else (chosen.tolist(), direction)
 
-    def draw(self, ax: Any = None, input_names: Sequence[str] | None = None) -> Any:
-        """Draw neurons and synapses with their present polarities, which training may turn where they are lean.
+    def draw(self, ax: Any = None, input_names: Sequence[str] | None = None, **more: Any) -> Any:
+        """Draw neurons, the readout's weights, and synapses with their present polarities.
 
         :param ax: matplotlib axes to draw into; new ones by default
         :param input_names: a name per sensory neuron
+        :param more: as for :func:`sb3_tbc.ndbc.drawing.draw_wiring`; the readout is this network's, unless it is given
         :return: the axes
         """
-        return self.signed_wiring().draw(ax, input_names)
+        more.setdefault("readout", self.readout_weights())
+        return self.signed_wiring().draw(ax, input_names, **more)
+
+    def readout_weights(self) -> FloatArray:
+        """Weight of each neuron on each output, ``(state_dim, n_outputs)``; zero for neurons that are not read."""
+        weight = functional.pad(self.readout_weight.detach(), (self.read_from, 0))
+        return np.asarray(weight.T.cpu().numpy())
 
     def signed_wiring(self) -> NDBCWiring:
         """The wiring with the polarities as they are now."""

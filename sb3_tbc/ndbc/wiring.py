@@ -226,16 +226,17 @@ class NDBCWiring:
         drawn.recurrent = np.sign(np.asarray(wiring.adjacency_matrix)[np.ix_(order, order)]).astype(np.int8)
         return drawn
 
-    def draw(self, ax: Any = None, input_names: Sequence[str] | None = None) -> Any:
+    def draw(self, ax: Any = None, input_names: Sequence[str] | None = None, **more: Any) -> Any:
         """Draw neurons and synapses with matplotlib; see :func:`sb3_tbc.ndbc.drawing.draw_wiring`.
 
         :param ax: matplotlib axes to draw into; new ones by default
         :param input_names: a name per sensory neuron
+        :param more: weights of a readout, names of its outputs, and how much each synapse is used
         :return: the axes
         """
         if self.drawer is None:
             raise RuntimeError("nothing draws wirings yet: import sb3_tbc.ndbc")
-        return self.drawer(self, ax, input_names)
+        return self.drawer(self, ax, input_names, **more)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, NDBCWiring) and self.to_dict() == other.to_dict()

@@ -166,7 +166,7 @@ def test_a_lean_network_draws_the_polarities_it_has_come_to() -> None:
     with th.no_grad():
         net.cell.synapse[:] = -net.cell.synapse.abs()
         net.cell.current_weight[:] = net.cell.current_weight.abs()
-    ax = net.draw()
+    ax = net.draw(readout=None)
     arrows = [text.arrow_patch for text in ax.texts if getattr(text, "arrow_patch", None) is not None]
     assert len(arrows) == net.wiring.n_synapses
     colours = {arrow.get_edgecolor()[:3] for arrow in arrows}

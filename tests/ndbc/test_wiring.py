@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_tbc.ndbc.drawing import dead_ends
 from sb3_tbc.ndbc.wiring import LAYERS, NDBCWiring
 
 TABLE_A1 = {
@@ -167,3 +168,47 @@ def test_it_draws_every_synapse() -> None:
     assert sum(len(c.get_offsets()) for c in ax.collections) == wiring.n_inputs + wiring.n_neurons
     with pytest.raises(ValueError, match="9 input names"):
         wiring.draw(input_names=["one"])
+
+
+def test_dead_ends_are_those_that_reach_no_output() -> None:
+    wiring = NDBCWiring(3, 4, 3, 2, 2, 2, 0, 1, seed=0)
+    wiring.recurrent[4] = 0  # command0 passes nothing on
+    sensory, neurons = dead_ends(wiring)
+    assert neurons[4]
+    assert not neurons[wiring.layer("motor")].any()
+    expected = [not any(neuron_reaches_motor(wiring, j) for j in np.flatnonzero(wiring.sensory[i])) for i in range(3)]
+    assert sensory.tolist() == expected
+    readout = np.zeros((wiring.n_neurons, 1))
+    readout[4] = 1.0  # read directly, it is none
+    assert not dead_ends(wiring, readout)[1][4]
+    assert dead_ends(wiring, readout)[1][wiring.layer("motor")].all()  # motor neurons that nobody reads are
+
+
+def neuron_reaches_motor(wiring: NDBCWiring, neuron: int) -> bool:
+    seen, waiting = set(), [neuron]
+    while waiting:
+        k = waiting.pop()
+        if k >= wiring.layer("motor").start:
+            return True
+        waiting += [int(j) for j in np.flatnonzero(wiring.recurrent[k]) if j not in seen]
+        seen.add(k)
+    return False
+
+
+def test_drawing_shows_the_readout_and_what_is_used() -> None:
+    pytest.importorskip("matplotlib")
+    wiring = NDBCWiring(3, 4, 3, 2, 2, 2, 0, 1, seed=0)
+    wiring.recurrent[4] = 0
+    readout = np.zeros((9, 2))
+    readout[7], readout[8] = (1.0, 0.0), (0.5, -2.0)
+    used = np.ones((3, 9)), np.ones((9, 9))
+    ax = wiring.draw(None, list("abc"), readout=readout, output_names=["pan", "lift"], used=used)
+    words = [text.get_text() for text in ax.texts]
+    assert {"a", "b", "c", "pan", "lift", "output (2)"} <= set(words)
+    assert any("dead ends" in w for w in words)
+    arrows = [t for t in ax.texts if getattr(t, "arrow_patch", None) is not None]
+    assert len(arrows) == wiring.n_synapses + 3
+    with pytest.raises(ValueError, match="output names"):
+        wiring.draw(readout=readout, output_names=["pan"])
+    with pytest.raises(ValueError, match="9 neurons"):
+        wiring.draw(readout=readout[:5])
