@@ -12,8 +12,9 @@ import numpy as np
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
-from .mujoco_rendering import ASSETS, GOAL_RGBA, SUBGOAL_RGBA, Scene
+from .mujoco_rendering import ASSETS, GOAL_RGBA, Scene
 from .mujoco_task import MujocoTask
+from .rendering import SUBGOAL, Canvas
 
 ROOM_SIGNS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 START_JOINTS = (0.0, 1.0, 0.0, -1.0, 0.0, -1.0, 0.0, 1.0)
@@ -164,12 +165,14 @@ class AntFourRooms(MujocoTask):
 
     def _add_markers(self, scene: Scene) -> None:
         scene.add_geom(mujoco.mjtGeom.mjGEOM_BOX, self.goal_tolerance, self._goal, GOAL_RGBA)
-        subgoal = self._overlay[0]
-        if subgoal is None:
-            return
-        scene.add_geom(mujoco.mjtGeom.mjGEOM_SPHERE, (0.35, 0.35, 0.35), subgoal[:3], SUBGOAL_RGBA)
+
+    def _draw_subgoal(self, canvas: Canvas, scene: Scene, subgoal: Array) -> None:
+        """A ring around the place, and an arrow to where the velocity leads in a second."""
+        at = scene.project(subgoal[:3])
+        canvas.ring(at, 12.0, SUBGOAL)
         if not self.legacy_quirks:
-            scene.add_arrow(subgoal[:3], (*subgoal[3:], 0.0), SUBGOAL_RGBA, 0.1)
+            ahead = scene.project(subgoal[:3] + np.array([*subgoal[3:], 0.0]))
+            canvas.arrow(at, (ahead[0] - at[0], ahead[1] - at[1]), SUBGOAL, 3.0)
 
 
 def _compact_local(observation: GoalObservation) -> FloatArray:

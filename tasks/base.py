@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
+from .rendering import Overlay
+
 with contextlib.redirect_stderr(io.StringIO()):  # Importing it prints a notice about environments not used here.
     from gymnasium_robotics.core import GoalEnv
 
@@ -96,7 +98,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         self._goal: Array = np.zeros(len(self.goal_low))
         self._goal_list: list[float] = self._goal.tolist()
         self._tolerance = np.asarray(self.goal_tolerance, dtype=np.float64)
-        self._overlay: tuple[Array | None, float | None, str | None] = (None, None, None)
+        self._overlay = Overlay()
         self._viewer: Any = None
         self._spec: EnvSpec | None = None
 
@@ -171,7 +173,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         goal, state = self._read_options(options or {})
         self._goal = np.array(self._sample_goal() if goal is None else goal, dtype=np.float64)
         self._goal_list = self._goal.tolist()
-        self._overlay = (None, None, None)
+        self._overlay = Overlay()
         self._elapsed = 0
         self._restart(state)
         observation, achieved = self._observe(True)
@@ -252,15 +254,21 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
             self._viewer = None
 
     def set_overlay(
-        self, subgoal: ArrayLike | None = None, time_left: float | None = None, text: str | None = None
+        self,
+        subgoal: ArrayLike | None = None,
+        time_left: float | None = None,
+        text: str | None = None,
+        steps_left: int | None = None,
     ) -> None:
         """Say what an agent pursues, to be drawn by :meth:`render` until the next reset.
 
         :param subgoal: live subgoal in task units, ``(subgoal_dim,)``
         :param time_left: remaining share of the time budget, 0 to 1
         :param text: a short line
+        :param steps_left: the remaining time in environment steps
         """
-        self._overlay = (None if subgoal is None else np.array(subgoal, dtype=np.float64), time_left, text)
+        at = None if subgoal is None else np.array(subgoal, dtype=np.float64)
+        self._overlay = Overlay(at, time_left, text, steps_left)
 
     @property
     def frame_dim(self) -> int:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 GOAL_RGBA = (0.13, 0.59, 0.33, 0.45)
-SUBGOAL_RGBA = (0.90, 0.47, 0.08, 0.55)
 
 ASSETS = """
   <visual>
@@ -151,6 +150,26 @@ class Scene:
         geom, arrow = self._next_geom(), mujoco.mjtGeom.mjGEOM_ARROW.value
         mujoco.mjv_initGeom(geom, arrow, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, "f4"))
         mujoco.mjv_connector(geom, arrow, width, begin, begin + along)
+
+    def project(self, point: ArrayLike) -> tuple[float, float]:
+        """Where a point of the world appears: pixels from the left and from the bottom of the picture."""
+        left, right = self.scene.camera
+        forward, up = np.array(left.forward, float), np.array(left.up, float)
+        seen = np.array(point, float) - 0.5 * (np.array(left.pos, float) + np.array(right.pos, float))
+        scale = 0.5 * self._viewport.height * left.frustum_near / left.frustum_top / max(seen @ forward, 1e-6)
+        x, y = seen @ np.cross(forward, up), seen @ up
+        return 0.5 * self._viewport.width + scale * x, 0.5 * self._viewport.height + scale * y
+
+    def places(self, qpos: ArrayLike, on_bodies: Sequence[tuple[str, ArrayLike]]) -> list[NDArray[np.float64]]:
+        """World positions in another configuration.
+
+        :param on_bodies: names of bodies, and points in their frames
+        """
+        ghost = self._ghost_data
+        ghost.qpos[:] = qpos
+        mujoco.mj_kinematics(self.model, ghost)
+        bodies = [(ghost.body(name), np.array(point, float)) for name, point in on_bodies]
+        return [body.xpos + body.xmat.reshape(3, 3) @ point for body, point in bodies]
 
     def _next_geom(self) -> Any:
         self.scene.ngeom += 1

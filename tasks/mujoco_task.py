@@ -87,7 +87,10 @@ class MujocoTask(GoalTask):
         raise NotImplementedError
 
     def _add_markers(self, scene: Scene) -> None:
-        """Add goal, subgoal and what else helps to the scene."""
+        """Add the goal and what else helps to the scene."""
+
+    def _draw_subgoal(self, canvas: Canvas, scene: Scene, subgoal: Array) -> None:
+        """Draw the live subgoal over the finished picture, so that nothing hides it."""
 
     def _draw(self) -> NDArray[np.uint8]:
         if self._scene is None:
@@ -99,8 +102,9 @@ class MujocoTask(GoalTask):
         self._scene.update(self._drawn)
         self._add_markers(self._scene)
         canvas = Canvas.over(self._scene.picture())
-        subgoal, time_left, text = self._overlay
-        canvas.overlay(f"{self._title}  step {self._elapsed}", time_left, text, subgoal is not None)
+        canvas.overlay(f"{self._title}  step {self._elapsed}", self._overlay)
+        if self._overlay.subgoal is not None:
+            self._draw_subgoal(canvas, self._scene, self._overlay.subgoal)
         return canvas.pixels
 
     def close(self) -> None:

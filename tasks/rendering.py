@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,15 @@ GOAL: Color = (34, 150, 83)
 SUBGOAL: Color = (230, 119, 20)
 TRIGGER: Color = (150, 80, 180)
 WATER: Color = (178, 211, 232)
+
+
+class Overlay(NamedTuple):
+    """What an agent pursues, to be drawn into a picture."""
+
+    subgoal: NDArray[np.float64] | None = None  # task units
+    time_left: float | None = None  # remaining share of the time budget, 0 to 1
+    text: str | None = None
+    steps_left: int | None = None  # the same in environment steps
 
 
 class Canvas:
@@ -121,6 +131,18 @@ class Canvas:
         sides = [(end[0] - ux - 0.5 * k * uy, end[1] - uy + 0.5 * k * ux) for k in (1, -1)]
         self.polygon([end, *sides], color, alpha)
 
+    def outline(self, points: Sequence[Point], color: Color, width: float = 3.0, closed: bool = True) -> None:
+        """Draw the border of a shape, or a path, with a light rim that sets it off from whatever lies below."""
+        ends = [*points[1:], points[0]] if closed else points[1:]
+        for shade, line, alpha in ((PAPER, width + 3.0, 0.8), (color, width, 1.0)):
+            for start, end in zip(points, ends, strict=False):
+                self.line(start, end, shade, line, alpha)
+
+    def ring(self, centre: Point, radius: float, color: Color, width: float = 3.0) -> None:
+        """Draw the border of a circle with a light rim."""
+        self.circle(centre, radius, PAPER, 0.8, line=width + 3.0)
+        self.circle(centre, radius, color, 1.0, line=width)
+
     def text(self, x: float, y: float, text: str, color: Color = INK, scale: int = 2) -> None:
         """Write a line with its upper left corner at pixel (x, y); what does not fit is cut off."""
         mask = text_mask(text, scale)
@@ -129,6 +151,16 @@ class Canvas:
         target[mask[: target.shape[0], : target.shape[1]]] = color
 
     # -- the overlay -----------------------------------------------------------------------------------------------
+
+    def _pixel_ring(self, centre: Point, radius: float, line: float, color: Color) -> None:
+        """A circle's border around a pixel (y down)."""
+        reach = radius + line
+        low, high = (centre[0] - reach, centre[1] - reach), (centre[0] + reach, centre[1] + reach)
+        window = self._window(low, high)
+        if window is not None:
+            x, y = _pixel_centres(window)
+            distance = np.sqrt((x - centre[0]) ** 2 + (y - centre[1]) ** 2) - radius
+            self._blend(window, np.abs(distance) - line / 2, color, 1.0)
 
     def time_ring(self, centre: Point, radius: float, share: float) -> None:
         """A ring (pixels, y down) of which the remaining share, clockwise up to twelve o'clock, is filled."""
@@ -143,31 +175,39 @@ class Canvas:
         turn = np.arctan2(x - cx, cy - y) / (2 * math.pi) % 1.0
         self._blend(window, np.where(turn <= min(max(share, 0.0), 1.0), distance, 10.0), SUBGOAL, 1.0)
 
-    def overlay(self, title: str, time_left: float | None, text: str | None, subgoal: bool) -> None:
-        """Title, legend, remaining time of the live subgoal and the agent's line of text."""
-        height, width = self.pixels.shape[:2]
-        self._panel(0, 0, 24 + 12 * max(len(title), 10), 76 if subgoal else 56)
+    def overlay(self, title: str, shown: Overlay) -> None:
+        """Title, legend, remaining time of the live subgoal and the agent's line of text.
+
+        Goals are filled shapes, subgoals outlines, so that they differ without their colours, too.
+        """
+        height = self.pixels.shape[0]
+        self._panel(0, 0, 24 + 12 * max(len(title), 10), 56 if shown.subgoal is None else 76)
         self.text(12, 12, title)
-        self._legend(12, 34, "GOAL", GOAL)
-        if subgoal:
-            self._legend(12, 54, "SUBGOAL", SUBGOAL)
-        if time_left is not None:
-            self._panel(width - 116, 0, 116, 64)
-            self.time_ring((width - 32, 32), 18, time_left)
-            label = f"{round(100 * min(max(time_left, 0.0), 1.0))}%"
-            self.text(width - 64 - 12 * len(label), 26, label)
-        if text:
-            self._panel(0, height - 36, 24 + 12 * len(text), 36)
-            self.text(12, height - 26, text)
+        self.pixels[35:47, 12:24] = GOAL
+        self.text(32, 34, "GOAL")
+        if shown.subgoal is not None:
+            self._pixel_ring((18, 61), 6.0, 3.0, SUBGOAL)
+            self.text(32, 54, "SUBGOAL")
+        if shown.time_left is not None:
+            self._time_left(shown.time_left, shown.steps_left)
+        if shown.text:
+            self._panel(0, height - 36, 24 + 12 * len(shown.text), 36)
+            self.text(12, height - 26, shown.text)
+
+    def _time_left(self, share: float, steps: int | None) -> None:
+        """A ring that empties in the upper right corner, and what it means in words."""
+        width = self.pixels.shape[1]
+        amount = f"{round(100 * min(max(share, 0.0), 1.0))} %" if steps is None else f"{steps} steps"
+        reach = 12 * max(len("time left"), len(amount)) + 76
+        self._panel(width - reach, 0, reach, 64)
+        self.time_ring((width - 32, 32), 18, share)
+        for row, label in ((16, "time left"), (36, amount)):
+            self.text(width - 64 - 12 * len(label), row, label)
 
     def _panel(self, x: int, y: int, width: int, height: int) -> None:
         """Lighten a rectangle of pixels so that text on it can be read."""
         target = self.pixels[y : y + height, x : x + width]
         target[:] = 0.35 * target + 0.65 * np.array(PAPER)
-
-    def _legend(self, x: int, y: int, label: str, color: Color) -> None:
-        self.pixels[y + 1 : y + 13, x : x + 12] = color
-        self.text(x + 20, y, label)
 
     # -- inner workings --------------------------------------------------------------------------------------------
 

@@ -13,8 +13,9 @@ from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
 from .history import FrameHistory
-from .mujoco_rendering import ASSETS, GOAL_RGBA, SUBGOAL_RGBA, Scene
+from .mujoco_rendering import ASSETS, GOAL_RGBA, Scene
 from .mujoco_task import MujocoTask
+from .rendering import SUBGOAL, Canvas
 
 N_FRAMES = 8
 MAX_SPEED = 4.0
@@ -109,6 +110,15 @@ DRAWN_MODEL = f"""
 """The arm as it is drawn."""
 
 
+SKELETON = (
+    ("shoulder_link", (0.0, 0.0, 0.0)),
+    ("upper_arm_link", (0.0, 0.0, 0.0)),
+    ("forearm_link", (0.0, 0.0, 0.0)),
+    ("forearm_link", (0.0, 0.0, 0.4313)),
+)
+"""Points along the arm: body, place in its frame."""
+
+
 class UR5Reacher(MujocoTask):
     """The UR5 reaching task of the HAC and HiTS benchmarks: three joints driven by velocity servos, gravity, a floor.
 
@@ -173,9 +183,14 @@ class UR5Reacher(MujocoTask):
 
     def _add_markers(self, scene: Scene) -> None:
         shoulder = np.flatnonzero(scene.model.geom_bodyid == scene.model.body("shoulder_link").id)
-        for ghost, rgba in ((self._goal, GOAL_RGBA), (self._overlay[0], SUBGOAL_RGBA)):
-            if ghost is not None:
-                scene.add_ghost(ghost[:3], rgba, without=shoulder.tolist())
+        scene.add_ghost(self._goal, GOAL_RGBA, without=shoulder.tolist())
+
+    def _draw_subgoal(self, canvas: Canvas, scene: Scene, subgoal: Array) -> None:
+        """The arm as lines from joint to joint."""
+        points = [scene.project(place) for place in scene.places(subgoal[:3], SKELETON)]
+        canvas.outline(points, SUBGOAL, 4.0, closed=False)
+        for point in points:
+            canvas.ring(point, 6.0, SUBGOAL)
 
 
 def describe_arm(n_frames: int) -> tuple[Array, Array, SubgoalSpace]:
