@@ -35,6 +35,11 @@ class Overlay(NamedTuple):
     steps_left: int | None = None  # the same in environment steps
 
 
+def in_steps(n: int) -> str:
+    """A number of steps in words."""
+    return f"{n} step" if n == 1 else f"{n} steps"
+
+
 class Canvas:
     """A picture that shapes are drawn on, with world coordinates (x right, y up).
 
@@ -197,7 +202,7 @@ class Canvas:
     def _time_left(self, share: float, steps: int | None) -> None:
         """A ring that empties in the upper right corner, and what it means in words."""
         width = self.pixels.shape[1]
-        amount = f"{round(100 * min(max(share, 0.0), 1.0))} %" if steps is None else f"{steps} steps"
+        amount = f"{round(100 * min(max(share, 0.0), 1.0))} %" if steps is None else in_steps(steps)
         reach = 12 * max(len("time left"), len(amount)) + 76
         self._panel(width - reach, 0, reach, 64)
         self.time_ring((width - 32, 32), 18, share)
@@ -233,3 +238,34 @@ def _pixel_centres(window: _Window) -> tuple[NDArray[np.float64], NDArray[np.flo
     top, bottom, left, right = window
     x, y = np.arange(left, right, dtype=np.float64), np.arange(top, bottom, dtype=np.float64)
     return x[None, :] + 0.5, y[:, None] + 0.5
+
+
+def with_caption(picture: NDArray[np.uint8], shown: Overlay, goal: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Any environment's picture with a strip below it: remaining time as a bar, subgoal and goal as numbers.
+
+    :param picture: ``(height, width, 3)``
+    :param shown: what the agent pursues
+    :param goal: the desired goal, task units
+    :return: a taller picture
+    """
+    width = picture.shape[1]
+    scale = 2 if width >= 400 else 1
+    row = 10 * scale
+    strip = Canvas(width, 4 * row + 12, 0.0, 0.0, 1.0)
+    lines = [shown.text or "", "time left", f"subgoal {_numbers(shown.subgoal)}", f"goal    {_numbers(goal)}"]
+    if shown.time_left is not None:
+        lines[1] += f" {in_steps(shown.steps_left or 0)}"
+        left, top = 6 * scale * 22, 6 + row
+        strip.pixels[top : top + 7 * scale, left : width - 8] = LIGHT_STATIC
+        end = left + round(min(max(shown.time_left, 0.0), 1.0) * (width - 8 - left))
+        strip.pixels[top : top + 7 * scale, left:end] = SUBGOAL
+    most = (width - 16) // (6 * scale)
+    for index, line in enumerate(lines):
+        if index != 1 or shown.time_left is not None:
+            fits = line if len(line) <= most else line[: most - 3] + "..."
+            strip.text(8, 6 + index * row, fits, SUBGOAL if index == 2 else GOAL if index == 3 else INK, scale)
+    return np.concatenate([picture, strip.pixels])
+
+
+def _numbers(values: NDArray[np.float64] | None) -> str:
+    return "" if values is None else " ".join(f"{value:.2f}" for value in values)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,17 +14,37 @@ from numpy.typing import NDArray
 
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
+from sb3_tbc.tasks.probe import said_success
+from sb3_tbc.tasks.rendering import Overlay, with_caption
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import Agent
 from sb3_tbc.tbc_hrl.policy import TwoLevelState
 
 Frame = NDArray[np.uint8]
+OUTCOME_SECONDS = 1.5
+"""How long the last picture of an episode stays, so that its outcome can be read."""
+
+
+def film(model: Agent, env: gym.Env[Any, Any], seed: int | None = None) -> Iterator[Frame]:
+    """The frames of :func:`episode_frames`, the last one held for :data:`OUTCOME_SECONDS`."""
+    frame = None
+    for frame in episode_frames(model, env, seed):
+        yield frame
+    if frame is not None:
+        for _ in range(round(OUTCOME_SECONDS * frames_per_second(env)) - 1):
+            yield frame
+
+
+def frames_per_second(env: gym.Env[Any, Any]) -> float:
+    """How many steps of a task take a second."""
+    return float(env.metadata.get("render_fps", 30))
 
 
 def episode_frames(model: Agent, env: gym.Env[Any, Any], seed: int | None = None) -> Iterator[Frame]:
     """Frames of one deterministic episode, one per step and one at the end, each ``(height, width, 3)``.
 
-    The episode ends as in an evaluation: success, time limit, or the high level's action budget used up.
+    The episode ends as in an evaluation: success, time limit, or the high level's action budget used up. Our own tasks
+    draw subgoal and remaining time into the scene; pictures of other environments get them in a strip below.
 
     :param model: a trained agent
     :param env: a task with ``render_mode="rgb_array"``
@@ -31,28 +52,35 @@ def episode_frames(model: Agent, env: gym.Env[Any, Any], seed: int | None = None
     """
     observation, _ = env.reset(seed=seed)
     state, start, over, result = None, np.array([True]), False, "time limit"
-    overlay = getattr(env.unwrapped, "set_overlay", None)
     while not over:
         action, carried = model.predict(observation, state, start, deterministic=True)
+        shown = Overlay()
         if isinstance(model, TBCHRL) and carried is not None:
             live = TwoLevelState(*carried)
             if live.used[0] > model.config.max_options:
                 result = "action budget used up"
                 break
-            if overlay is not None:
-                left = model.rules.remaining(live.time_budget - live.elapsed + 1)
-                overlay(live.subgoal[0], float(left[0]), f"option {live.used[0]} of {model.config.max_options}")
-        yield _frame(env)
+            shown = _pursuit(model, live)
+        yield _frame(env, shown, observation)
         observation, _, terminated, truncated, info = env.step(action)
         state, start = carried, np.array([False])
         over = terminated or truncated
-        result = "success" if info.get("is_success") else result
-    if overlay is not None:
-        overlay(text=result)
-    yield _frame(env)
+        if said_success(info):
+            result = "success"
+    yield _frame(env, Overlay(text=result), observation)
 
 
-def _frame(env: gym.Env[Any, Any]) -> Frame:
+def _pursuit(model: TBCHRL, live: TwoLevelState) -> Overlay:
+    """What an agent pursues in the coming step."""
+    left = live.time_budget - live.elapsed + 1
+    text = f"option {live.used[0]} of {model.config.max_options}"
+    return Overlay(live.subgoal[0], float(model.rules.remaining(left)[0]), text, max(math.ceil(left[0]), 0))
+
+
+def _frame(env: gym.Env[Any, Any], shown: Overlay, observation: Any) -> Frame:
+    draws_itself = hasattr(env.unwrapped, "set_overlay")
+    if draws_itself:
+        env.unwrapped.set_overlay(*shown)  # type: ignore[attr-defined]
     try:
         picture: Any = env.render()
     except Exception as error:  # An environment's own code may fail in any way.
@@ -60,8 +88,11 @@ def _frame(env: gym.Env[Any, Any]) -> Frame:
         raise ConfigError(f"the environment cannot be drawn: {error}{cure}") from error
     if not isinstance(picture, np.ndarray):
         raise ConfigError(f"the environment cannot be drawn: render() gave {picture!r}, not an array; see render_mode")
+    if not draws_itself:
+        picture = with_caption(picture, shown, np.asarray(observation["desired_goal"], dtype=np.float64))
     height, width = picture.shape[:2]
-    return picture[: height - height % 2, : width - width % 2]  # the codec wants even sizes
+    frame: Frame = picture[: height - height % 2, : width - width % 2]  # the codec wants even sizes
+    return frame
 
 
 def record_video(model: Agent, env: gym.Env[Any, Any], path: Path, n_episodes: int = 3, seed: int = 0) -> None:
@@ -79,12 +110,12 @@ def record_video(model: Agent, env: gym.Env[Any, Any], path: Path, n_episodes: i
     imageio = require("imageio.v2", extra="video", what="a film")
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
-    fps = env.metadata.get("render_fps", 30)
+    fps = frames_per_second(env)
     try:
         writer: Any
         with imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
             for episode in range(n_episodes):
-                for frame in episode_frames(model, env, seed + episode):
+                for frame in film(model, env, seed + episode):
                     writer.append_data(frame)
         os.replace(temporary, path)
     finally:

@@ -58,6 +58,34 @@ def test_picture_shows_subgoal_and_time(task):
     assert changed[80:].any()  # the subgoal itself, below legend and ring
 
 
+@pytest.mark.parametrize("where", [(0.0, 0.0), (2.0, 0.0), (0.0, -2.0), (-7.25, 0.0), (-9.0, 9.0), (9.0, -9.0)])
+def test_no_wall_and_no_label_hides_the_ants_subgoal(where):
+    bare, marked = render("AntFourRooms", {}, {"subgoal": [*where, 0.5, 0.0, 0.0]})
+    legend = count(marked[50:72, 8:28], SUBGOAL)
+    assert count(marked, SUBGOAL) - legend > 60
+    assert count(bare, SUBGOAL) == 0
+
+
+def test_goal_and_subgoal_differ_without_their_colours():
+    """A subgoal in the very place of the goal changes the picture's brightness: it is another shape."""
+    for task, subgoal in (("Pendulum", [0.1, 0.2]), ("Platforms", [-0.5, 0.45, 0.0, 0.0])):
+        env = make(task, render_mode="rgb_array")
+        env.reset(seed=0, options={"goal": subgoal[:2]})
+        pictures = []
+        for shown in (None, subgoal):
+            env.unwrapped.set_overlay(subgoal=shown)
+            pictures.append(env.render()[80:].astype(int).sum(axis=-1))
+        assert (np.abs(pictures[0] - pictures[1]) > 60).sum() > 100
+
+
+def test_the_ring_says_how_many_steps_are_left():
+    full, one = render("Drawbridge", {"time_left": 0.5, "steps_left": 12}, {"time_left": 0.5, "steps_left": 1})
+    words = slice(30, 54), slice(620, 736)
+    assert (full[words] != one[words]).any()
+    np.testing.assert_array_equal(full[:30], one[:30])
+    np.testing.assert_array_equal(full[70:], one[70:])
+
+
 def test_rendering_changes_nothing():
     """Episodes with and without pictures agree to the bit."""
     for task in [*PLANAR, "AntFourRooms"]:

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
+from sb3_tbc.tasks.rendering import SUBGOAL
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.zoo.video import episode_frames, record_video
+from sb3_tbc.zoo.video import episode_frames, film, record_video
 
 ENV_ID = "sb3_tbc/Drawbridge-v0"
 
@@ -27,20 +29,59 @@ def test_frames_follow_the_live_option(model: TBCHRL, monkeypatch: pytest.Monkey
     monkeypatch.setattr(
         env.unwrapped,
         "set_overlay",
-        lambda subgoal=None, time_left=None, text=None: (
-            seen.append((subgoal, time_left, text)),
-            original(subgoal, time_left, text),
-        ),
+        lambda *shown: (seen.append(shown), original(*shown)),
     )
     frames = list(episode_frames(model, env, seed=0))
     assert len(frames) == len(seen)
     assert all(frame.dtype == np.uint8 and frame.ndim == 3 for frame in frames)
     assert all(side % 2 == 0 for side in frames[0].shape[:2])
-    times = [time for _, time, _ in seen[:-1]]
+    times = [time for _, time, _, _ in seen[:-1]]
+    steps = [left for _, _, _, left in seen[:-1]]
+    assert all(round(time * model.rules.dt_max) in (left, left - 1) for time, left in zip(times, steps, strict=True))
     assert all(0.0 <= time <= 1.0 for time in times)
     changes = [i for i in range(1, len(times)) if times[i] > times[i - 1]]
     assert len(changes) <= 1  # two options: time runs down, jumps once, runs down
     assert seen[-1][2].endswith("action budget used up")
+
+
+def test_the_outcome_stays_for_a_second_and_a_half(model: TBCHRL) -> None:
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    once, held = list(episode_frames(model, env, seed=0)), list(film(model, env, seed=0))
+    assert len(held) == len(once) + 1.5 * 60 - 1
+    assert all(np.array_equal(frame, once[-1]) for frame in held[len(once) :])
+
+
+class Painter(gym.Env[Any, Any]):
+    """A foreign environment that draws a plain picture and knows nothing of overlays."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+
+    def __init__(self, width: int) -> None:
+        self.width, self.inner = width, gym.make(ENV_ID)
+        self.observation_space, self.action_space = self.inner.observation_space, self.inner.action_space
+
+    def reset(self, **kwargs: Any) -> Any:
+        return self.inner.reset(**kwargs)
+
+    def step(self, action: Any) -> Any:
+        *rest, _ = self.inner.step(action)
+        return *rest, {"success": True}
+
+    def render(self) -> Any:
+        return np.zeros((100, self.width, 3), np.uint8)
+
+
+@pytest.mark.parametrize("width", [80, 300, 640])
+def test_foreign_pictures_get_a_strip_with_bar_and_numbers(model: TBCHRL, width: int) -> None:
+    frames = list(episode_frames(model, Painter(width), seed=0))
+    assert frames[0].shape[0] > 130
+    assert frames[0].shape[1:] == (width, 3)
+    assert not frames[0][:100].any()
+    orange = [int((frame == np.array(SUBGOAL)).all(axis=-1).sum()) for frame in frames]
+    assert orange[0] > 0
+    if width > 200:
+        assert orange[0] > orange[10]  # the bar shrinks
+    assert any((frames[-1][100:] != frames[-2][100:]).any(axis=(1, 2)))
 
 
 def test_the_file_is_written_whole(model: TBCHRL, tmp_path: Path) -> None:
