@@ -6,16 +6,24 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.tasks.time_limit import declared_limit, time_limit
+
 
 def attribute_of(env: VecEnv, name: str) -> Any:
     """Attribute of the first task under its wrappers; None where there is none."""
-    try:
-        return env.get_attr(name, indices=[0])[0]
-    except AttributeError:
-        return None
+    # Asking for what is not there would end the process of an environment that has one of its own.
+    return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
 
 
 def episode_length(env: VecEnv) -> int | None:
-    """Time limit of the task, environment steps; None where the environment has none."""
-    steps = attribute_of(env, "max_episode_steps") or getattr(attribute_of(env, "spec"), "max_episode_steps", None)
-    return None if steps is None else int(steps)
+    """Time limit of the task under its wrappers, environment steps; None where it has none.
+
+    Environments in this process are looked at layer by layer, those in others by what their attributes say.
+    """
+    inner = getattr(env.unwrapped, "envs", None)
+    if inner:
+        return time_limit(inner[0])
+    truncates_itself = attribute_of(env, "truncates_itself")
+    return declared_limit(
+        attribute_of(env, "spec"), attribute_of(env, "max_episode_steps"), truncates_itself in (None, True)
+    )

@@ -1,0 +1,50 @@
+"""What an agent asks of its environment: the time limit is the one that episodes really have."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import pytest
+from corridor import Corridor
+from gymnasium.wrappers import TimeLimit
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+
+from sb3_tbc import TBCHRL
+from sb3_tbc.tbc_hrl.environment import episode_length
+
+ID = "sb3_tbc/Pendulum-v0"
+
+
+def short() -> gym.Env[Any, Any]:
+    return gym.make(ID, max_episode_steps=100)
+
+
+def longer() -> gym.Env[Any, Any]:
+    return gym.make(ID, max_episode_steps=2000)
+
+
+def wrapped() -> gym.Env[Any, Any]:
+    return TimeLimit(gym.make(ID), 100)
+
+
+@pytest.mark.parametrize(("make", "steps"), [(short, 100), (longer, 2000), (wrapped, 100), (Corridor, 50)])
+def test_windows_follow_the_limit_that_episodes_have(make: Any, steps: int) -> None:
+    model = TBCHRL("MultiInputPolicy", make(), max_options=5, compile=False)
+    assert model.dt_max == steps / 5
+    assert episode_length(VecMonitor(DummyVecEnv([make, make]))) == steps
+
+
+@pytest.mark.parametrize(("make", "steps"), [(longer, 2000), (Corridor, 50)])
+def test_the_same_across_processes(make: Any, steps: int) -> None:
+    env = SubprocVecEnv([make])
+    try:
+        assert episode_length(env) == steps
+    finally:
+        env.close()
+
+
+def test_fewer_steps_than_decisions_are_no_mistake() -> None:
+    model = TBCHRL("MultiInputPolicy", Corridor(max_episode_steps=7), compile=False)
+    assert (model.dt_max, model.config.max_options) == (1.0, 20)
+    model.learn(30)
