@@ -21,9 +21,10 @@ def episode_length(env: VecEnv) -> int | None:
     Environments in this process are looked at layer by layer, those in others by what their attributes say.
     """
     inner = getattr(env.unwrapped, "envs", None)
+    limit: int | None
     if inner:
-        return time_limit(inner[0])
-    truncates_itself = attribute_of(env, "truncates_itself")
-    return declared_limit(
-        attribute_of(env, "spec"), attribute_of(env, "max_episode_steps"), truncates_itself in (None, True)
-    )
+        limit = time_limit(inner[0])
+    else:
+        keeps_own = attribute_of(env, "truncates_itself") in (None, True)
+        limit = declared_limit(attribute_of(env, "spec"), attribute_of(env, "max_episode_steps"), keeps_own)
+    return limit
