@@ -100,6 +100,14 @@ def stop_like_ctrl_c() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
+def add_trust(parser: argparse.ArgumentParser) -> None:
+    """The option that lets a saved agent run code that it brings along."""
+    parser.add_argument(
+        "--trust", action="store_true", help="let the agent's file run code that it brings along: needed for agents of "
+        "version 0.1, for classes of your own, and to import the module of its environment",
+    )  # fmt: skip
+
+
 def positive_int(text: str) -> int:
     """A whole number above zero, ``1e5`` allowed.
 

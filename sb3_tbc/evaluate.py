@@ -9,13 +9,13 @@ from typing import Any
 
 import torch as th
 
-from sb3_tbc.commands import Parser, positive_int, run_command
+from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
-from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, load_model, read_zip
+from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, environment_of, load_model, read_zip
 from sb3_tbc.zoo.environments import NAMESPACE, make_env, resolve_env
 from sb3_tbc.zoo.ledger import summarise, to_json
 from sb3_tbc.zoo.runner import evaluation_envs
@@ -42,34 +42,36 @@ def build_parser() -> Parser:
     parser.add_argument("--video", type=Path, metavar="OUT.mp4", help="film episodes with subgoal and remaining time")
     parser.add_argument("--video-episodes", type=positive_int, default=3, help="episodes in the film")
     parser.add_argument("--render", action="store_true", help="show episodes in a window before they are counted")
+    add_trust(parser)
     parser.add_argument("--device", default="cpu", help="torch device")
     parser.add_argument("--num-threads", type=positive_int, default=1, help="torch threads")
     return parser
 
 
-def identify(path: Path, env: str | None) -> dict[str, Any]:
+def identify(path: Path, env: str | None, trust: bool = False) -> dict[str, Any]:
     """What the ``.zip`` says of itself, and the environment to evaluate it on.
 
     :param path: the agent
     :param env: environment asked for, or ``None`` for the agent's own
+    :param trust: whether a module that the agent names may be imported
     :raises ConfigError: for a broken or foreign ``.zip``, and when no environment is known
     """
     data = read_zip(path)
-    saved = data.get(RUN_INFO) or {}
+    saved = data[RUN_INFO] if isinstance(data.get(RUN_INFO), dict) else {}
     info = {"algo": algorithm_of(path, data), "variant": "full", "config": "custom", "seed": data.get("seed"), **saved}
     if env is not None:
         task, env_id = resolve_env(env)
         # Our own tasks take the same arguments, so a policy sees the layout it was trained with in another engine, too.
         own = all(str(i).startswith(NAMESPACE) for i in (env_id, info.get("env_id")))
         keep = own or env_id == info.get("env_id")
-        info.update(task=task, env_id=env_id, env_kwargs=info["env_kwargs"] if keep else {})
-    if "env_id" not in info:
-        raise ConfigError(f"{path} does not say what environment it was trained on; pass --env")
-    return info
+        info.update(task=task, env_id=env_id, env_kwargs=info.get("env_kwargs", {}) if keep else {})
+        return info
+    env_id, env_kwargs = environment_of(path, data, trust)
+    return {"task": env_id, **info, "env_id": env_id, "env_kwargs": env_kwargs}
 
 
 def evaluate(
-    path: Path, info: dict[str, Any], n_episodes: int, seed: int, stochastic: bool, device: str
+    path: Path, info: dict[str, Any], n_episodes: int, seed: int, stochastic: bool, device: str, trust: bool = False
 ) -> dict[str, Any]:
     """Evaluate an agent and return what is printed and written.
 
@@ -77,7 +79,7 @@ def evaluate(
     """
     env = evaluation_envs(info["env_id"], n_episodes, seed, info["env_kwargs"])
     try:
-        model = load_model(path, env, device)
+        model = load_model(path, env, device, trust)
         result = evaluate_agent(model, env, n_episodes, seed=seed, deterministic=not stochastic)
     finally:
         env.close()
@@ -116,16 +118,22 @@ def command(argv: Sequence[str]) -> int:
     if args.video is not None:  # told before the episodes are counted, which may take minutes
         require("imageio", extra="video", what="a film")
     th.set_num_threads(args.num_threads)
-    info = identify(args.model, args.env)
+    info = identify(args.model, args.env, args.trust)
     if args.render:
-        _watch(args.model, info, args.n_episodes, args.seed, args.device)
-    result = evaluate(args.model, info, args.n_episodes, args.seed, args.stochastic, args.device)
+        _watch(args.model, info, args.n_episodes, args.seed, args.device, args.trust)
+    result = evaluate(args.model, info, args.n_episodes, args.seed, args.stochastic, args.device, args.trust)
     _tell(result, args.json)
     if args.video is not None:
         from sb3_tbc.zoo.video import record_video
 
         env = make_env(info["env_id"], **info["env_kwargs"])
-        record_video(load_model(args.model, device=args.device), env, args.video, args.video_episodes, args.seed)
+        record_video(
+            load_model(args.model, device=args.device, trust=args.trust),
+            env,
+            args.video,
+            args.video_episodes,
+            args.seed,
+        )
         env.close()
         print(f"video            {args.video}", file=sys.stderr)
     return 0
@@ -143,7 +151,7 @@ def _tell(result: Mapping[str, Any], json_out: str | None) -> None:
         print(describe(result), file=sys.stderr)
 
 
-def _watch(path: Path, info: Mapping[str, Any], n_episodes: int, seed: int, device: str) -> None:
+def _watch(path: Path, info: Mapping[str, Any], n_episodes: int, seed: int, device: str, trust: bool) -> None:
     """Play episodes in a window; episode ``i`` starts from ``seed + i``.
 
     :raises ConfigError: if the environment cannot be drawn, or there is no display
@@ -151,7 +159,7 @@ def _watch(path: Path, info: Mapping[str, Any], n_episodes: int, seed: int, devi
     from sb3_tbc.tasks.window import Window
     from sb3_tbc.zoo.video import episode_frames
 
-    model, env = load_model(path, device=device), make_env(info["env_id"], **info["env_kwargs"])
+    model, env = load_model(path, device=device, trust=trust), make_env(info["env_id"], **info["env_kwargs"])
     try:
         window = Window(f"{info['task']}, {info['algo']}", env.metadata.get("render_fps", 30))
         for episode in range(n_episodes):

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command
+from sb3_tbc.commands import INTERRUPTED, Parser, add_trust, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
@@ -73,6 +73,7 @@ def build_parser() -> Parser:
                          help="torch threads; more than one is slower on networks this small")  # fmt: skip
     machine.add_argument("--progress", action=argparse.BooleanOptionalAction,
                          help="progress bar; by default on a terminal")  # fmt: skip
+    add_trust(parser)
     return parser
 
 
@@ -176,6 +177,7 @@ def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> 
         checkpoint_seconds=60.0 * args.checkpoint_minutes,
         keep_checkpoint=args.keep_checkpoint,
         stop=stop,
+        trust=args.trust,
     )
     try:
         folder, result = _run(args, options, argv)

@@ -37,7 +37,7 @@ def test_a_former_command_runs() -> None:
 @pytest.mark.parametrize("kind", [TBCHRL, HiTS, HAC])
 def test_agents_of_the_first_version_load_and_act_the_same(kind: type[TBCHRL]) -> None:
     env = make("Pendulum")
-    model = kind.load(AGENTS / f"{kind.__name__}-0.1.0.zip", env=env)
+    model = kind.load(AGENTS / f"{kind.__name__}-0.1.0.zip", env=env, trust=True)
     observation, _ = env.reset(seed=5)
     state = None
     for expected in json.loads((AGENTS / "actions.json").read_text())[kind.__name__]:

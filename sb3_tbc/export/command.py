@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sb3_tbc.commands import Parser, positive_int, run_command
+from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
 from sb3_tbc.export.policy import MLP, Circuit, ExportedPolicy, extract
 from sb3_tbc.extras import require
 from sb3_tbc.files import save_atomic, write_atomic
@@ -34,6 +34,7 @@ def build_parser() -> Parser:
                         "with the exported policy, and say how much their actions differ")  # fmt: skip
     parser.add_argument("--env", help="where --check plays; by default the task the agent was trained on")
     parser.add_argument("--seed", type=int, default=0, help="seed of the episodes that --check plays")
+    add_trust(parser)
     return parser
 
 
@@ -78,7 +79,7 @@ def command(argv: Sequence[str]) -> int:
     args = build_parser().parse_args(argv)
     if args.format == "onnx":  # told before the agent is loaded
         require("onnx", extra="export", what="--format onnx")
-    model = load_two_levels(args.model)
+    model = load_two_levels(args.model, trust=args.trust)
     name = args.model.with_suffix(SUFFIXES[args.format])
     path = args.output or (Path(name.name) if is_pretrained(args.model) else name)  # never into the package
     policy = extract(model, args.model.stem)
@@ -92,7 +93,7 @@ def command(argv: Sequence[str]) -> int:
         from sb3_tbc.evaluate import identify
         from sb3_tbc.export.check import check
 
-        info = identify(args.model, args.env)
+        info = identify(args.model, args.env, args.trust)
         print(check(model, policy, args.format, path, info, args.check, args.seed))
     elif isinstance(policy.low, Circuit) and args.format != "onnx":
         print("closed form: not compared with the agent; measure it before you use it, with --check STEPS")

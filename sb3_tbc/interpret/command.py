@@ -9,7 +9,7 @@ from typing import Any
 
 import torch as th
 
-from sb3_tbc.commands import Parser, positive_int, run_command
+from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.evaluate import identify
 from sb3_tbc.files import save_atomic, write_atomic
@@ -56,6 +56,7 @@ def build_parser() -> Parser:
     parser.add_argument("--synapses", action="store_true", help="cut every synapse, too, one at a time: slow")
     parser.add_argument("--device", default="cpu", help="torch device")
     parser.add_argument("--num-threads", type=positive_int, default=1, help="torch threads")
+    add_trust(parser)
     return parser
 
 
@@ -63,8 +64,8 @@ def command(argv: Sequence[str]) -> int:
     """Interpret; see ``--help``."""
     args = build_parser().parse_args(argv)
     th.set_num_threads(args.num_threads)
-    info = identify(args.model, args.env)
-    model = load_two_levels(args.model, device=args.device)
+    info = identify(args.model, args.env, args.trust)
+    model = load_two_levels(args.model, device=args.device, trust=args.trust)
     units, space = units_of(model), space_of(info["task"], model.layout.subgoals)
     if not isinstance(units, CircuitUnits) and (args.synapses or args.wiring):
         asked = "--synapses" if args.synapses else "--wiring"

@@ -22,6 +22,7 @@ from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSe
 from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.environment import attribute_of
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
+from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
 CYCLE = 100
 """Environment steps between two bursts of updates."""
@@ -70,7 +71,7 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
         return samples._replace(dones=th.from_numpy(dones).reshape(-1, 1).to(self.device))
 
 
-class FlatSAC(SAC):
+class FlatSAC(PlainAlgorithm, SAC):
     """SB3's SAC, goal-conditioned, with :class:`TerminatingHerReplayBuffer`, under the names of our configurations.
 
     :param policy: ``"MultiInputPolicy"``

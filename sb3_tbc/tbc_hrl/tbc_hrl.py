@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
@@ -35,6 +34,7 @@ from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY
+from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
 
@@ -43,7 +43,7 @@ MIN_UPDATES_TO_COMPILE = 3000
 """With ``compile="auto"`` fewer updates than this run eagerly: compiling costs about as much as they do."""
 
 
-class TBCHRL(BaseAlgorithm):
+class TBCHRL(PlainAlgorithm):
     """Timed and bionic circuit hierarchical reinforcement learning (Li, Shan, Mo 2025), two SAC levels.
 
     Settings are given by name, see :class:`~sb3_tbc.tbc_hrl.config.TBCConfig`; those of a level as ``high={...}`` and

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import json
-import zipfile
+import shlex
+import sys
 from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.outside import one_line
+from sb3_tbc.tasks.foreign import ROBOTICS
 from sb3_tbc.tbc_hrl import HAC, TBCHRL, HiTS
+from sb3_tbc.tbc_hrl.archive import UntrustedError, read_bytes, read_data
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.environments import make_envs
@@ -59,19 +62,7 @@ def read_zip(path: Path) -> dict[str, Any]:
     """
     if path.is_dir():
         raise ConfigError(f"{path} is a folder, not an agent's .zip; {_inside(path)}")
-    if not path.is_file():
-        raise ConfigError(f"no such file: {path} (an agent is saved as .zip by train or model.save)")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            broken = archive.testzip()
-            data = json.loads(archive.read("data"))
-    except (zipfile.BadZipFile, KeyError, ValueError, OSError, EOFError) as error:
-        raise ConfigError(f"{path} is not a complete agent .zip (truncated or another format): {error}") from error
-    if broken is not None:
-        raise ConfigError(f"{path} is damaged: {broken} fails its checksum")
-    if not isinstance(data, dict):
-        raise ConfigError(f"{path} is not an agent .zip: its data is no table")
-    return data
+    return read_data(read_bytes(path), str(path))
 
 
 def _inside(folder: Path) -> str:
@@ -82,6 +73,31 @@ def _inside(folder: Path) -> str:
         return "there is no .zip inside it"
     more = f" (and {len(found) - 1} more inside it)" if len(found) > 1 else ""
     return f"did you mean {found[0]}?{more}"
+
+
+def environment_of(path: Path, data: dict[str, Any], trust: bool = False) -> tuple[str, dict[str, Any]]:
+    """Id and arguments of the environment that an agent says it was trained on.
+
+    :param path: of the agent, for messages
+    :param data: as :func:`read_zip` gave it
+    :param trust: whether a module that the agent names may be imported
+    :raises UntrustedError: if the id names a module, other than Gymnasium-Robotics, that would be imported
+    :raises ConfigError: if it does not say, or what it says is no environment
+    """
+    info = data.get(RUN_INFO)
+    info = info if isinstance(info, dict) else {}
+    env_id, env_kwargs = info.get("env_id"), info.get("env_kwargs", {})
+    if env_id is None:
+        raise ConfigError(f"{path} does not say what environment it was trained on; pass --env")
+    if not isinstance(env_id, str) or not isinstance(env_kwargs, dict):
+        raise ConfigError(f"{path} names no environment, but {one_line(env_id)!r}; pass --env")
+    module = env_id.rpartition(":")[0]
+    if module and not trust and module != ROBOTICS and module not in sys.modules:
+        raise UntrustedError(
+            f"{path} asks to import the module {one_line(module)!r} for its environment, which can run any code; if "
+            f"you trust it, pass --env {shlex.quote(one_line(env_id))} or --trust"
+        )
+    return env_id, env_kwargs
 
 
 def algorithm_of(path: Path, data: dict[str, Any]) -> str:
@@ -104,30 +120,35 @@ def algorithm_of(path: Path, data: dict[str, Any]) -> str:
     )
 
 
-def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu") -> Agent:
+def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu", trust: bool = False) -> Agent:
     """Load an agent of any of our algorithms.
 
     :param path: the ``.zip``
     :param env: environments to act in; an agent that needs some to be loaded gets those it was trained on
     :param device: torch device
+    :param trust: whether code that the file brings along may run, see :meth:`.PlainAlgorithm.load`
+    :raises UntrustedError: if it cannot be loaded without that
     :raises ConfigError: if it cannot be loaded
     """
     data = read_zip(path)
     name = algorithm_of(path, data)
     try:
         if env is None and ALGORITHMS[name] is FlatSAC:
-            env = make_envs(data[RUN_INFO]["env_id"], 1, None, data[RUN_INFO]["env_kwargs"])
-        return ALGORITHMS[name].load(path, env=env, device=device)
-    except (ValueError, TypeError, KeyError, RuntimeError) as error:
-        raise ConfigError(f"cannot load {path} as {name}: {error}") from error
+            env_id, env_kwargs = environment_of(path, data, trust)
+            env = make_envs(env_id, 1, None, env_kwargs)
+        return ALGORITHMS[name].load(path, env=env, device=device, trust=trust)
+    except ConfigError:
+        raise
+    except Exception as error:  # a stranger's file can be wrong in any way
+        raise ConfigError(f"cannot load {path} as {name}: {type(error).__name__}: {one_line(error)}") from error
 
 
-def load_two_levels(path: Path, env: VecEnv | None = None, device: str = "cpu") -> TBCHRL:
+def load_two_levels(path: Path, env: VecEnv | None = None, device: str = "cpu", trust: bool = False) -> TBCHRL:
     """Load an agent that has subgoals.
 
     :raises ConfigError: if it cannot be loaded or has none
     """
-    model = load_model(path, env, device)
+    model = load_model(path, env, device, trust)
     if not isinstance(model, TBCHRL):
         raise ConfigError(f"{path} holds a flat agent, without the two levels that are needed here")
     return model

@@ -115,6 +115,7 @@ class RunOptions:
     :param checkpoint_seconds: time between checkpoints; infinite for none, but for the one when stopped
     :param keep_checkpoint: keep the last checkpoint (with replay buffers) of a finished run
     :param save_at_end: save a checkpoint when training is stopped, or ended by a fault of an environment
+    :param trust: whether a checkpoint may run code that it brings along, see :func:`.load_model`
     :param stop: tells whether the user asked to stop; training stops at the next point to go on from
     """
 
@@ -126,6 +127,7 @@ class RunOptions:
     checkpoint_seconds: float = 600.0
     keep_checkpoint: bool = False
     save_at_end: bool = True
+    trust: bool = False
     stop: StopRequest = field(default_factory=StopRequest)
 
 
@@ -219,7 +221,7 @@ def _only_evaluate(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dic
     """Finish a run that ended between training and its result."""
     env = make_envs(spec.env_id, spec.run.n_envs, spec.seed, spec.run.env_kwargs)
     try:
-        model = load_model(folder.model, env, options.device)
+        model = load_model(folder.model, env, options.device, options.trust)
     finally:
         env.close()
     rows = folder.read_evaluations()
@@ -237,7 +239,7 @@ def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dict[str, A
         raise ConfigError(f"{folder.path} is at {done} of {spec.run.n_timesteps} steps already; raise --n-timesteps")
     env = make_envs(spec.env_id, spec.run.n_envs, spec.seed + done, spec.run.env_kwargs)
     try:
-        model = load_model(checkpoint.model, env, options.device)
+        model = load_model(checkpoint.model, env, options.device, options.trust)
         model.load_replay_buffer(checkpoint.replay_buffer)
         keep_only(folder.path, checkpoint)
         with explained(folder.path):

@@ -1,0 +1,156 @@
+"""What a saved agent's ``.zip`` may hold, looked at before anything of it is used."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.outside import one_line
+from sb3_tbc.tbc_hrl.plain import NotPlainError, decode
+
+DATA, PLAIN_DATA = "data", "plain.json"
+PICKLED = ":serialized:"
+"""Key of SB3 in ``data``: what lies under it is unpickled by SB3's own loading."""
+MAX_MEMBERS = 200
+MAX_DATA = 64 * 2**20
+"""Largest ``data`` or ``plain.json``, bytes; ours have some 10,000."""
+MAX_GROWTH = 20
+SMALL = 2**20
+"""A file may unpack to so many times its size, and this much more; SB3 does not compress at all."""
+NAME = re.compile(r"[A-Za-z_][\w.]*")
+
+
+class UntrustedError(ConfigError):
+    """Loading would run code that the file brings along, and nobody said that it is trusted."""
+
+
+def read_bytes(path: str | Path | io.BufferedIOBase) -> bytes:
+    """The whole file, also where ``.zip`` is left out as SB3 allows.
+
+    :raises ConfigError: if it is missing or cannot be read
+    """
+    if not isinstance(path, str | Path):
+        return path.read()
+    given = Path(path)
+    file = given if given.suffix or given.is_file() else given.with_suffix(".zip")
+    try:
+        return file.read_bytes()
+    except FileNotFoundError as error:
+        raise ConfigError(f"no such file: {file} (an agent is saved as .zip by train or model.save)") from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot read {file}: {one_line(error)}") from error
+
+
+def read_data(content: bytes, name: str) -> dict[str, Any]:
+    """The tables ``data`` and, under its name, ``plain.json`` of an agent, after a look at the whole file.
+
+    :param content: of the file
+    :param name: of the file, for messages
+    :raises ConfigError: if it is damaged, no agent, or holds what no agent holds
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            _check_members(archive, len(content), name)
+            broken = archive.testzip()
+            if broken is not None:
+                raise ConfigError(f"{name} is damaged: {one_line(broken)} fails its checksum")
+            for member in archive.namelist():
+                if member.endswith(".pth"):
+                    _check_weights(archive.read(member), f"{name}, {member}")
+            data = _table(archive, DATA, name)
+            if PLAIN_DATA in archive.namelist():
+                data[PLAIN_DATA] = _table(archive, PLAIN_DATA, name)
+            return data
+    except ConfigError:
+        raise
+    except Exception as error:  # zipfile, zlib and json raise many kinds of errors for a broken file
+        text = one_line(error)
+        raise ConfigError(f"{name} is not a complete agent .zip (truncated or another format): {text}") from error
+
+
+def _check_members(archive: zipfile.ZipFile, size: int, name: str) -> None:
+    members = archive.infolist()
+    names = [member.filename for member in members]
+    for member in members:
+        if not NAME.fullmatch(member.filename) or member.flag_bits & 1:
+            raise ConfigError(f"{name} holds {one_line(repr(member.filename))}, which no agent holds")
+    if len(members) > MAX_MEMBERS or len(set(names)) < len(names):
+        raise ConfigError(f"{name} holds {len(members)} files, some of them twice; no agent does")
+    if sum(member.file_size for member in members) > MAX_GROWTH * size + SMALL:
+        raise ConfigError(f"{name} would unpack to far more than its {size} bytes; no agent does")
+
+
+def _check_weights(content: bytes, name: str) -> None:
+    """Look into a file of weights, itself a ``.zip``, for one that would unpack to far more than its size."""
+    if not zipfile.is_zipfile(io.BytesIO(content)):
+        return  # torch refuses what is none
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        if sum(member.file_size for member in archive.infolist()) > MAX_GROWTH * len(content) + SMALL:
+            raise ConfigError(f"{name} would unpack to far more than its {len(content)} bytes; no agent does")
+
+
+def _table(archive: zipfile.ZipFile, member: str, name: str) -> dict[str, Any]:
+    if archive.getinfo(member).file_size > MAX_DATA:
+        raise ConfigError(f"{name}: {member} has more than {MAX_DATA} bytes")
+    table = json.loads(archive.read(member))
+    if not isinstance(table, dict):
+        raise ConfigError(f"{name} is not an agent .zip: its {member} is no table")
+    return table
+
+
+def pickled_keys(data: dict[str, Any]) -> list[str]:
+    """The entries of ``data`` that SB3 would unpickle."""
+    return [key for key, value in data.items() if isinstance(value, dict) and PICKLED in value]
+
+
+def unpickled(data: dict[str, Any], name: str, given: dict[str, Any], has_env: bool) -> dict[str, Any]:
+    """For SB3's ``custom_objects``: a plain value for every entry that it would unpickle otherwise.
+
+    :param data: as :func:`read_data` gave it
+    :param name: of the file, for messages
+    :param given: values that the caller has for some entries
+    :param has_env: whether the caller brings an environment, whose own subgoal space then takes the place of one
+        without a plain form
+    :raises UntrustedError: if an entry has no plain value that makes sense, or the file brings an environment along
+    """
+    plain = data.get(PLAIN_DATA, {})
+    if "env" in data:
+        raise UntrustedError(f"{name} brings an environment along; {CURE}")
+    values: dict[str, Any] = {}
+    for key in pickled_keys(data):
+        if key in given:
+            continue
+        if has_env and key == "subgoals" and not _has_form(plain.get(key)):
+            values[key] = None
+            continue
+        if key not in plain:
+            raise UntrustedError(f"{name} holds {one_line(key)!r} as a pickle, which can run any code; {CURE}")
+        try:
+            values[key] = decode(plain[key])
+        except (NotPlainError, RecursionError) as error:
+            text = f"{name}: {one_line(key)} in {PLAIN_DATA} makes no sense here: {one_line(error)}"
+            raise UntrustedError(f"{text}; {CURE}") from error
+    return values
+
+
+def _has_form(data: Any) -> bool:
+    try:
+        return decode(data) is not None
+    except (NotPlainError, RecursionError):
+        return False
+
+
+CURE = "if you trust where it comes from, load it with trust=True (commands: --trust)"
+
+
+def with_plain(content: bytes, plain: dict[str, Any]) -> bytes:
+    """The file with the table ``plain.json`` added."""
+    buffer = io.BytesIO(content)
+    with zipfile.ZipFile(buffer, "a") as archive:
+        archive.writestr(PLAIN_DATA, json.dumps(plain, indent=1))
+    return buffer.getvalue()

@@ -1,0 +1,84 @@
+"""Saving agents so that loading them runs no code, and loading them so."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+
+from sb3_tbc.files import save_atomic
+from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
+from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
+
+SelfPlain = TypeVar("SelfPlain", bound="PlainAlgorithm")
+
+
+class PlainAlgorithm(BaseAlgorithm):
+    """An SB3 algorithm whose ``.zip`` holds, besides what SB3 pickles, the same as plain JSON, from which it loads.
+
+    SB3's own functions read the file as any other.
+    """
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Write the agent to a ``.zip``, see SB3; a file that is there is replaced at once or not at all.
+
+        :raises WriteError: if it cannot be written
+        """
+        buffer = io.BytesIO()
+        super().save(buffer, exclude, include)
+        content = buffer.getvalue()
+        content = with_plain(content, self._plain(content))
+        if not isinstance(path, str | pathlib.Path):
+            path.write(content)
+            return
+        target = pathlib.Path(path)
+        target = target if target.suffix else target.with_suffix(".zip")
+        save_atomic(lambda name: pathlib.Path(name).write_bytes(content), target)
+
+    def _plain(self, content: bytes) -> dict[str, Any]:
+        """What SB3 has pickled, as far as it has a plain form; the rest needs ``trust=True`` when it is loaded."""
+        plain = {}
+        for key in pickled_keys(read_data(content, type(self).__name__)):
+            try:
+                plain[key] = encode(getattr(self, key))
+            except NotPlainError:
+                continue
+        return plain
+
+    @classmethod
+    def load(
+        cls: type[SelfPlain],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        trust: bool = False,
+        **kwargs: Any,
+    ) -> SelfPlain:
+        """Load an agent, see SB3, without running anything that the file brings along.
+
+        :param trust: also unpickle what has no plain form, as SB3 always does: agents of versions up to 0.1, policy
+            classes and subgoal functions of your own. Say so for files alone whose origin you trust: unpickling can
+            run any code.
+        :raises UntrustedError: if the file holds something that must be unpickled, unless ``trust`` is given
+        :raises ConfigError: if the file is damaged or no agent
+        """
+        name = str(path) if isinstance(path, str | pathlib.Path) else "the agent"
+        content = read_bytes(path)
+        data, given = read_data(content, name), dict(custom_objects or {})
+        plain = {} if trust else unpickled(data, name, given, env is not None)
+        return super().load(
+            io.BytesIO(content), env, device, {**plain, **given}, print_system_info, force_reset, **kwargs
+        )
