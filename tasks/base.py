@@ -50,6 +50,8 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     """Steps after which an episode is truncated, unless a ``TimeLimit`` says otherwise."""
     truncates_itself: bool = True
     """Whether the task itself keeps the time limit; false where ``gymnasium.make`` adds a ``TimeLimit``."""
+    reward_range: ClassVar[tuple[float, float]] = (-1.0, 0.0)
+    """Lowest and highest reward of a step."""
     success_terminates: bool = True
     """Whether an episode ends with success; false only where the public implementation is followed to the letter."""
     achieved_in_observation: bool = True

@@ -134,7 +134,8 @@ class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
         self.goal_scale = self.description.goal_scale
         self.max_episode_steps = self.description.max_episode_steps
         self._terminate_on_success = terminate_on_success
-        self._best = self.description.success_test.best
+        self._best, worst = self.description.success_test.best, self.description.success_test.worst
+        self.reward_range = None if worst is None else (worst - self._best, 0.0)
 
     def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
         """The environment's own reward, shifted to 0 at the goal; single or batched."""

@@ -27,6 +27,7 @@ class SuccessTest(NamedTuple):
     best: float
     own: str | None = None  # one of OWN_TESTS
     vectorised: bool = True  # whether the own test takes batches
+    worst: float | None = None  # the reward elsewhere, where it is the same everywhere else
     near: SubgoalSpace | None = None  # its thresholds, as the user gave them; without these two the reward says it
 
     def of(self, env: gym.Env[Any, Any]) -> Test:
@@ -69,7 +70,7 @@ def success_test_of(env: gym.Env[Any, Any], probe: Probe, near: SubgoalSpace | N
     values = np.unique(np.append(np.round(rewards, 6), round(best, 6)))
     if len(values) == 1:
         raise ValueError(f"its reward is {best:.6g} for every observed pair of goals, as if all goals were the same")
-    found = SuccessTest(best) if len(values) == 2 else _own_test(env, best, probe, near)
+    found = SuccessTest(best, worst=float(values[0])) if len(values) == 2 else _own_test(env, best, probe, near)
     wrong = 0 if found.near else _disagreements(found.of(env), probe)
     if wrong:
         raise ValueError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from typing import Any, NamedTuple
 
@@ -11,6 +12,7 @@ from gymnasium import spaces
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
+from sb3_tbc.smdp.bounds import RewardRange, ValueBounds, high_level_bounds, low_level_bounds
 from sb3_tbc.smdp.hindsight import HindsightSettings
 from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
@@ -21,6 +23,8 @@ from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.reachability import Reachability
 from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
+
+logger = logging.getLogger(__name__)
 
 
 class LevelSpaces(NamedTuple):
@@ -108,15 +112,55 @@ def make_schedule(
 # -------------------------------------------------------------------------------------------------- levels
 
 
-def make_high_level(config: TBCConfig, ends: LevelSpaces, seed: int, device: th.device) -> SACLevel:
+def make_high_bounds(
+    config: TBCConfig, reward: HighLevelReward, rules: OptionRules, rewards: RewardRange | None
+) -> ValueBounds | None:
+    """What the high level's targets are clipped to; None: to nothing.
+
+    :param rewards: of an environment step; None where they are not known, which leaves targets free
+    """
+    if config.high.target_bounds != "auto":
+        return _given_bounds(config.high)
+    if rewards is None:
+        logger.warning(
+            "the environment does not say its reward_range, so the high level's targets are not bounded; give the "
+            "environment an attribute reward_range = (low, high), or set high.target_bounds to [low, high]"
+        )
+        return None
+    tested = config.testing_fraction > 0
+    known = RewardRange(*rewards)  # a plain list in agents that were loaded
+    return high_level_bounds(reward, rules, known, config.failed_test_reward if tested else None)
+
+
+def make_low_bounds(config: TBCConfig, reward: LowLevelReward) -> ValueBounds | None:
+    """What the low level's targets are clipped to; None: to nothing."""
+    if config.low.target_bounds != "auto":
+        return _given_bounds(config.low)
+    return low_level_bounds(reward, config.low.gamma)
+
+
+def _given_bounds(level: LevelConfig) -> ValueBounds | None:
+    return None if isinstance(level.target_bounds, str) else ValueBounds(*level.target_bounds)
+
+
+def make_high_level(
+    config: TBCConfig, ends: LevelSpaces, seed: int, device: th.device, bounds: ValueBounds | None
+) -> SACLevel:
     """The level that chooses subgoals and time budgets."""
     policy_kwargs = config.high.policy_kwargs.to_kwargs()
     if policy_kwargs["negative_critic"] is None:
         policy_kwargs["negative_critic"] = True
-    return _make_level("high", config, config.high, ends, policy_kwargs, seed, device)
+    return _make_level("high", config, config.high, ends, policy_kwargs, seed, device, bounds)
 
 
-def make_low_level(config: TBCConfig, ends: LevelSpaces, seed: int, device: th.device, views: LevelViews) -> SACLevel:
+def make_low_level(
+    config: TBCConfig,
+    ends: LevelSpaces,
+    seed: int,
+    device: th.device,
+    bounds: ValueBounds | None,
+    views: LevelViews,
+) -> SACLevel:
     """The level that executes subgoals; its actor is the circuit unless its ``policy_kwargs["ndbc"]`` is None."""
     policy_kwargs = config.low.policy_kwargs.to_kwargs()
     circuit = policy_kwargs["ndbc"]
@@ -127,7 +171,7 @@ def make_low_level(config: TBCConfig, ends: LevelSpaces, seed: int, device: th.d
             circuit["input_scale"] = views.low_scale().tolist()
     if policy_kwargs["negative_critic"] is None:
         policy_kwargs["negative_critic"] = config.low_reward == "step"
-    return _make_level("low", config, config.low, ends, policy_kwargs, seed, device)
+    return _make_level("low", config, config.low, ends, policy_kwargs, seed, device, bounds)
 
 
 def _make_level(
@@ -138,6 +182,7 @@ def _make_level(
     policy_kwargs: dict[str, Any],
     seed: int,
     device: th.device,
+    bounds: ValueBounds | None,
 ) -> SACLevel:
     actor_rate = level.actor_learning_rate
     return SACLevel(
@@ -151,13 +196,15 @@ def _make_level(
         tau=level.tau,
         ent_coef=level.ent_coef,
         target_entropy=level.target_entropy,
-        policy_kwargs=policy_kwargs,
+        policy_kwargs={**policy_kwargs, "critic_norm": level.critic_norm},
         seed=seed,
         device=device,
         compile=config.compile,
         name=name,
         label_coef=config.duration_loss_coef if name == "high" else 0.0,
         average_decay=level.average_decay,
+        bounds=bounds,
+        actor_q=level.actor_q,
     )
 
 

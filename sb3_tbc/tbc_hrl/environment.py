@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.tasks.time_limit import declared_limit, time_limit
 
 
@@ -13,6 +15,15 @@ def attribute_of(env: VecEnv, name: str) -> Any:
     """Attribute of the first task under its wrappers; None where there is none."""
     # Asking for what is not there would end the process of an environment that has one of its own.
     return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
+
+
+def reward_range(env: VecEnv) -> RewardRange | None:
+    """Lowest and highest reward of a step, which tasks say as ``reward_range``; None where the environment does not."""
+    said = attribute_of(env, "reward_range")
+    if said is None or not np.all(np.isfinite(said)):
+        return None
+    low, high = said
+    return RewardRange(float(low), float(high))
 
 
 def episode_length(env: VecEnv) -> int | None:

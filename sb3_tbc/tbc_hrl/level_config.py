@@ -160,6 +160,15 @@ class LevelConfig(Settings):
     """Entropy that an automatic temperature aims at; auto: minus the number of action dimensions."""
     buffer_size: Annotated[int, Range(1, 1_000_000_000)] = 1_000_000
     """Transitions that the replay buffer holds."""
+    target_bounds: Literal["auto", "none"] | Annotated[tuple[float, float], Increasing()] = "none"
+    """Clip the critics' targets: ``auto`` to the lowest and highest return that rewards, penalties and discount allow,
+    with room for the temperature's share above; ``[low, high]`` to these; ``none`` not at all."""
+    critic_norm: Literal["none", "layer", "batch"] = "none"
+    """Normalise the critics' layers: ``layer`` normalisation, or ``batch`` normalisation without target networks
+    (CrossQ)."""
+    actor_q: Literal["min", "mean", "max"] | Fraction = "min"
+    """Which value of the critics the actor climbs: the smallest as in SAC, the mean, the largest, or a number between 0
+    (smallest) and 1 (largest); small actors learn less from a pessimistic one."""
     policy_kwargs: PolicyConfig = PolicyConfig()
     """Networks of the level."""
 

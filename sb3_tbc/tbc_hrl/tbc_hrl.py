@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.settings import hints
+from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.goal_spaces import check_goal_space
 from sb3_tbc.smdp.hindsight import check_goal_strategy
 from sb3_tbc.smdp.options import Episode
@@ -30,7 +31,7 @@ from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, goal_test_of
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of
-from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length
+from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, reward_range
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY
@@ -84,6 +85,7 @@ class TBCHRL(PlainAlgorithm):
         self.settings = config.to_dict()
         self.subgoals = others.subgoals
         self.episode_length: int | None = None
+        self.reward_range: RewardRange | None = None
         self._n_updates = 0
         self._updated_at = 0
         self.collector: Collector | None = None
@@ -137,8 +139,10 @@ class TBCHRL(PlainAlgorithm):
         self.low_level_reward = LowLevelReward(config.low_reward, subgoals, self.rules)
         high_spaces = LevelSpaces(self.layout.high_space(space), self.layout.high_action_space())
         low_spaces = LevelSpaces(self.layout.low_space(), spaces.Box(-1.0, 1.0, actions.shape, np.float32))
-        self.high = assembly.make_high_level(config, high_spaces, seeds[1], self.device)
-        self.low = assembly.make_low_level(config, low_spaces, seeds[2], self.device, self.layout)
+        high_bounds = assembly.make_high_bounds(config, self.high_reward, self.rules, self.reward_range)
+        low_bounds = assembly.make_low_bounds(config, self.low_level_reward)
+        self.high = assembly.make_high_level(config, high_spaces, seeds[1], self.device, high_bounds)
+        self.low = assembly.make_low_level(config, low_spaces, seeds[2], self.device, low_bounds, self.layout)
         self.reachability = assembly.make_reachability(config, subgoals, self.rules, seeds[6])
         self.schedule = assembly.make_schedule(config, self.layout, self.rules, self.reachability)
         self.replay_buffer = Replay(
@@ -171,6 +175,7 @@ class TBCHRL(PlainAlgorithm):
         self.achieved_in_observation = True if achieved_in_observation is None else bool(achieved_in_observation)
         if self.episode_length is None:
             self.episode_length = episode_length(env)
+        self.reward_range = reward_range(env)
 
     # ------------------------------------------------------------------ learning
 
