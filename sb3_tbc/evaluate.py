@@ -14,8 +14,9 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
+from sb3_tbc.tasks.layouts import layout_of
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
-from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, environment_of, load_model, read_zip
+from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, environment_of, load_model, observation_size, read_zip
 from sb3_tbc.zoo.environments import NAMESPACE, make_env, resolve_env
 from sb3_tbc.zoo.ledger import summarise, to_json
 from sb3_tbc.zoo.runner import evaluation_envs
@@ -65,6 +66,9 @@ def identify(path: Path, env: str | None, trust: bool = False) -> dict[str, Any]
         own = all(str(i).startswith(NAMESPACE) for i in (env_id, info.get("env_id")))
         keep = own or env_id == info.get("env_id")
         info.update(task=task, env_id=env_id, env_kwargs=info.get("env_kwargs", {}) if keep else {})
+        layout = layout_of(task, observation_size(data) or 0)
+        if layout is not None and "observation" not in info["env_kwargs"]:  # saved by model.save, without arguments
+            info["env_kwargs"] = {**info["env_kwargs"], "observation": layout}
         return info
     env_id, env_kwargs = environment_of(path, data, trust)
     return {"task": env_id, **info, "env_id": env_id, "env_kwargs": env_kwargs}

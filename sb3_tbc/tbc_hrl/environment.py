@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.smdp.bounds import RewardRange
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, width
+from sb3_tbc.tasks.layouts import layout_cure
 from sb3_tbc.tasks.time_limit import declared_limit, time_limit
 
 
@@ -39,3 +46,39 @@ def episode_length(env: VecEnv) -> int | None:
         keeps_own = attribute_of(env, "truncates_itself") in (None, True)
         limit = declared_limit(attribute_of(env, "spec"), attribute_of(env, "max_episode_steps"), keeps_own)
     return limit
+
+
+def check_sizes(space: spaces.Dict, batch: dict[str, NDArray[Any]]) -> None:
+    """Refuse observations of another size than an agent was trained on.
+
+    :param space: the agent's observation space
+    :param batch: goal observations ``(..., size)``
+    :raises ValueError: with both sizes, and the layout to use where the task has one that fits
+    """
+    for key in GOAL_KEYS:
+        expected, shape = width(space, key), np.shape(batch[key])
+        given = shape[-1] if shape else 0
+        if given != expected or len(shape) > 2:
+            cure = layout_cure(expected, given) if key == "observation" else ""
+            raise ValueError(
+                f"this agent acts on {key} of shape ({expected},) or (n, {expected}), got {tuple(shape)}.{cure}"
+            )
+
+
+@contextlib.contextmanager
+def mismatch_explained() -> Iterator[None]:
+    """Name the layout to use where SB3 finds that an agent and an environment do not have the same observations.
+
+    :raises ValueError: SB3's message and the cure
+    """
+    try:
+        yield
+    except ValueError as error:
+        sizes = re.findall(r"'observation': Box\([^()]*\((\d+),\)", str(error))
+        if "Observation spaces do not match" not in str(error) or len(sizes) != 2:
+            raise
+        expected, given = map(int, sizes)
+        raise ValueError(
+            f"this agent was trained on observations of {expected} entries, the environment gives {given}."
+            f"{layout_cure(expected, given)}"
+        ) from error

@@ -20,6 +20,7 @@ from sb3_tbc.smdp.hierarchical_vec_env import Schedule
 from sb3_tbc.smdp.options import OptionClock, OptionRules
 from sb3_tbc.smdp.views import LevelViews
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
+from sb3_tbc.tbc_hrl.environment import check_sizes
 
 
 class TwoLevelState(NamedTuple):
@@ -142,6 +143,7 @@ class TBCPolicy(BasePolicy):
         if not isinstance(observation, dict) or any(key not in observation for key in GOAL_KEYS):
             found = sorted(observation) if isinstance(observation, dict) else type(observation).__name__
             raise ValueError(f"predict needs a goal observation with the keys {sorted(GOAL_KEYS)}, got {found}")
+        check_sizes(cast(spaces.Dict, self.observation_space), observation)
         single_precision = {key: np.asarray(observation[key], dtype=np.float32) for key in GOAL_KEYS}
         batch = {key: part.astype(np.float64) for key, part in single_precision.items()}  # as exported policies see it
         single = batch["observation"].ndim == 1

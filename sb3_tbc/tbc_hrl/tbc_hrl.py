@@ -31,7 +31,7 @@ from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, goal_test_of
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of
-from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, reward_range
+from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, mismatch_explained, reward_range
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY
@@ -297,6 +297,15 @@ class TBCHRL(PlainAlgorithm):
         self.logger.dump(step=self.num_timesteps)
 
     # ------------------------------------------------------------------ saving
+
+    @classmethod
+    def load(cls: type[SelfTBCHRL], *args: Any, **kwargs: Any) -> SelfTBCHRL:
+        """Load an agent, see SB3.
+
+        :raises ValueError: if the environment given does not fit, naming the layout that does
+        """
+        with mismatch_explained():
+            return super().load(*args, **kwargs)
 
     def learning_state(self) -> dict[str, np.ndarray[Any, Any]]:
         """What learning goes on from besides weights and replay, as plain arrays: random streams, open options."""

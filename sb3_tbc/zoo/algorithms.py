@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 from pathlib import Path
@@ -118,6 +119,14 @@ def algorithm_of(path: Path, data: dict[str, Any]) -> str:
     raise ConfigError(
         f"{path} holds an agent of another algorithm ({name or origin or 'unknown'}), not of {', '.join(ALGORITHMS)}"
     )
+
+
+def observation_size(data: dict[str, Any]) -> int | None:
+    """Entries of ``observation`` that an agent acts on, from what its ``.zip`` says; None if it does not say."""
+    space = data.get("observation_space")
+    described = str(space.get("spaces")) if isinstance(space, dict) else ""
+    found = re.search(r"'observation': Box\([^()]*\((\d+),\)", described)
+    return None if found is None else int(found[1])
 
 
 def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu", trust: bool = False) -> Agent:
