@@ -64,6 +64,8 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     """Largest difference per goal coordinate that counts as success (inclusive), task units."""
     dynamics_names: ClassVar[tuple[str, ...]] = ()
     """Physical quantities that :meth:`set_dynamics` can scale."""
+    velocity_entries: ClassVar[tuple[int, ...]] = ()
+    """Entries of a frame of ``observation`` that are velocities, for tasks that have a variant without them."""
     goal_is_fixed: ClassVar[bool] = False
     """Whether every episode has the same desired goal."""
     observation_scale: Array
@@ -276,6 +278,16 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     def frame_dim(self) -> int:
         """Entries per frame where ``observation`` stacks several frames, else its length."""
         return len(self.observation_scale)
+
+    def subgoals_without_velocities(self) -> SubgoalSpace:
+        """The subgoal space of the variant that hides :attr:`velocity_entries`.
+
+        :raises ValueError: if the task has no such variant
+        """
+        raise ValueError(
+            f"hide_velocities must be false for {type(self).__name__}: Pendulum, UR5Reacher and UR5ReacherBullet have "
+            "such a variant"
+        )
 
     def switch_goal(self) -> None:
         """Draw another desired goal in the middle of an episode."""

@@ -43,6 +43,7 @@ class Pendulum(GoalTask):
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
     max_episode_steps = 1000
     dynamics_names = ("mass", "damping", "gravity", "actuator")
+    velocity_entries = (2,)
     action_bound = (2.0,)
     goal_low = (-math.pi, -MAX_SPEED)
     goal_high = (math.pi, MAX_SPEED)
@@ -68,6 +69,13 @@ class Pendulum(GoalTask):
             names=("angle", "velocity"),
         )
         return local_scale.copy(), goal_scale, subgoals
+
+    def subgoals_without_velocities(self) -> SubgoalSpace:
+        """Angle and velocity as before, of which the low level sees the angle alone."""
+        whole = self.subgoals
+        return SubgoalSpace(
+            whole.low, whole.high, whole.thresholds, _achieved_goal, _angle_alone, whole.local_scale[:2], whole.names
+        )
 
     def _sample_goal(self) -> Sequence[float]:
         angle = math.radians(16.0)
@@ -126,6 +134,14 @@ class Pendulum(GoalTask):
 
     def _draw(self) -> NDArray[np.uint8]:
         return draw_pendulum(self._angle, self._speed, self._goal, self._overlay, self._elapsed)
+
+
+def _achieved_goal(observation: GoalObservation) -> FloatArray:
+    return observation["achieved_goal"]
+
+
+def _angle_alone(observation: GoalObservation) -> FloatArray:
+    return observation["observation"][..., :2]
 
 
 def _local(observation: GoalObservation) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Stress variants of the tasks: sensor noise, late actions, altered physics, goals that change on the way."""
+"""Stress variants of the tasks: sensor noise, late actions, altered physics, changing goals, hidden velocities."""
 
 from __future__ import annotations
 
@@ -29,7 +29,10 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
     :param dynamics_scale: factors on physical quantities, e.g. ``{"mass": 1.2, "friction": [0.5, 1.5]}``; a pair is a
         range from which each episode draws. Every task lists its names in ``dynamics_names``
     :param goal_switch: probability per step that the desired goal is drawn anew before the step
-    :raises ValueError: for values out of range, unknown quantities, and goal switches where the goal is fixed
+    :param hide_velocities: show 0 in place of velocities (Pendulum, UR5Reacher), so that one observation does not tell
+        the state; the low level does not see these entries at all, and subgoals are read from ``achieved_goal``
+    :raises ValueError: for values out of range, unknown quantities, goal switches where the goal is fixed, and hidden
+        velocities where the task has no such variant
     """
 
     def __init__(
@@ -39,6 +42,7 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
         action_delay: int = 0,
         dynamics_scale: Mapping[str, Scale] | None = None,
         goal_switch: float = 0.0,
+        hide_velocities: bool = False,
     ) -> None:
         super().__init__(env)
         self._task: GoalTask = env
@@ -53,6 +57,11 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
         env.check_dynamics(self._scales)
         if self._switch > 0 and env.goal_is_fixed:
             raise ValueError(f"goal_switch must be 0 for {type(env).__name__}: its goal is always the same")
+        self._hidden: list[int] = []
+        if hide_velocities:
+            self.subgoals = env.subgoals_without_velocities()
+            frames = range(0, len(env.observation_scale), env.frame_dim)
+            self._hidden = [first + entry for first in frames for entry in env.velocity_entries]
         self._rng: np.random.Generator = np.random.default_rng()
         self._pending: deque[NDArray[Any]] = deque()
         self._noise_stack: NDArray[np.float64] = np.zeros(len(env.observation_scale))
@@ -92,6 +101,8 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
             fresh = self._rng.normal(0.0, self._noise, frame) * self._task.observation_scale[-frame:]
             stack[:] = np.tile(fresh, len(stack) // frame) if first else np.concatenate([stack[frame:], fresh])
             observation["observation"] += stack
+        if self._hidden:
+            observation["observation"][self._hidden] = 0.0
         return observation
 
 

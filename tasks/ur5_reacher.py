@@ -148,6 +148,7 @@ class UR5Reacher(MujocoTask):
     goal_low = (-2 * math.pi,) * 3
     goal_high = (2 * math.pi,) * 3
     goal_tolerance = (math.radians(10.0),) * 3
+    velocity_entries = (3, 4, 5)
 
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
@@ -162,6 +163,10 @@ class UR5Reacher(MujocoTask):
 
     def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
         return describe_arm(N_FRAMES if self.layout == "paper" else 1)
+
+    def subgoals_without_velocities(self) -> SubgoalSpace:
+        """The joint angles alone."""
+        return angles_of_arm(self.subgoals)
 
     def _sample_goal(self) -> Sequence[float]:
         return sample_arm_goal(self.np_random)
@@ -213,6 +218,15 @@ def describe_arm(n_frames: int) -> tuple[Array, Array, SubgoalSpace]:
     return np.tile(local_scale, n_frames), np.full(3, math.pi), subgoals
 
 
+def angles_of_arm(whole: SubgoalSpace) -> SubgoalSpace:
+    """The subgoal space of the reaching task without its velocities, which the low level does not see either."""
+    first = slice(3)
+    return SubgoalSpace(
+        whole.low[first], whole.high[first], whole.thresholds[first], _achieved_goal, _angles, whole.local_scale[first],
+        whole.names[first],
+    )  # fmt: skip
+
+
 def sample_arm_goal(rng: np.random.Generator) -> list[float]:
     """Draw a desired configuration (pan, lift, elbow) that keeps elbow and wrist clear of the floor."""
     while True:
@@ -222,6 +236,14 @@ def sample_arm_goal(rng: np.random.Generator) -> list[float]:
         wrist_height = elbow_height - FOREARM * math.sin(lift + elbow)
         if abs(pan) > math.pi / 4 and elbow_height > 0.05 and wrist_height > 0.15:
             return [pan, lift, elbow]
+
+
+def _achieved_goal(observation: GoalObservation) -> FloatArray:
+    return observation["achieved_goal"]
+
+
+def _angles(observation: GoalObservation) -> FloatArray:
+    return observation["observation"][..., -6:-3]
 
 
 def _local(observation: GoalObservation) -> FloatArray:

@@ -19,7 +19,7 @@ from sb3_tbc.smdp.spaces import SubgoalSpace
 from .base import Array
 from .history import FrameHistory
 from .replayed import ReplayedTask
-from .ur5_reacher import N_FRAMES, START, UR5Reacher, describe_arm, sample_arm_goal
+from .ur5_reacher import N_FRAMES, START, UR5Reacher, angles_of_arm, describe_arm, sample_arm_goal
 
 TIME_STEP = 0.002
 SUB_STEPS = 15
@@ -74,6 +74,7 @@ class UR5ReacherBullet(ReplayedTask):
     action_bound = UR5Reacher.action_bound
     goal_low, goal_high = UR5Reacher.goal_low, UR5Reacher.goal_high
     goal_tolerance = UR5Reacher.goal_tolerance
+    velocity_entries = UR5Reacher.velocity_entries
 
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
@@ -91,6 +92,10 @@ class UR5ReacherBullet(ReplayedTask):
 
     def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
         return describe_arm(N_FRAMES if self.layout == "paper" else 1)
+
+    def subgoals_without_velocities(self) -> SubgoalSpace:
+        """The joint angles alone."""
+        return angles_of_arm(self.subgoals)
 
     def _sample_goal(self) -> Sequence[float]:
         return sample_arm_goal(self.np_random)

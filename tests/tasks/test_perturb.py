@@ -125,3 +125,38 @@ def test_goals_switch_consistently():
 def test_mistakes_are_explained(task, perturb, word):
     with pytest.raises(ValueError, match=word):
         make(task, perturb=perturb)
+
+
+@pytest.mark.parametrize("layout", ["paper", "compact"])
+@pytest.mark.parametrize("task", ["Pendulum", "UR5Reacher", "UR5ReacherBullet"])
+def test_hidden_velocities_show_nowhere_and_rewards_stay(task, layout):
+    hidden = make(task, layout, perturb={"hide_velocities": True, "observation_noise": 0.1})
+    plain = make(task, layout, perturb={"observation_noise": 0.1})
+    seen, whole = trace(hidden, 40), trace(plain, 40)
+    shown = stack(seen)
+    frames = shown.reshape(len(shown), -1, hidden.unwrapped.frame_dim)
+    moving = list(hidden.unwrapped.velocity_entries)
+    assert not frames[..., moving].any()
+    still = [i for i in range(frames.shape[-1]) if i not in moving]
+    others = stack(whole).reshape(frames.shape)[..., still]
+    np.testing.assert_array_equal(frames[..., still], others)
+    np.testing.assert_array_equal(stack(seen, "achieved_goal"), stack(whole, "achieved_goal"))
+    subgoals = hidden.get_wrapper_attr("subgoals")
+    batch = {key: stack(seen, key) for key in seen[0]}
+    assert subgoals.local(batch).shape == (41, subgoals.local_dim)
+    assert subgoals.local_dim == hidden.unwrapped.subgoals.local_dim - len(moving)
+    np.testing.assert_array_equal(subgoals.achieved(batch), batch["achieved_goal"])
+
+
+def test_velocities_cannot_be_hidden_everywhere():
+    with pytest.raises(ValueError, match="hide_velocities must be false for Drawbridge"):
+        make("Drawbridge", perturb={"hide_velocities": True})
+
+
+def test_an_agent_learns_without_velocities():
+    from sb3_tbc import TBCHRL
+
+    env = make("Pendulum", perturb={"hide_velocities": True}, max_episode_steps=60)
+    model = TBCHRL("MultiInputPolicy", env, max_options=4, memory="episode", compile=False, seed=0)
+    assert model.subgoals.local_dim == 2
+    model.learn(130)
