@@ -22,6 +22,7 @@ from sb3_tbc.zoo.config import CONFIGS, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
+from sb3_tbc.zoo.settings_page import settings_text
 
 EXAMPLES = {
     "sb3_tbc.train": "TBC-HRL on Pendulum; the run is kept in runs/Pendulum/tbc-hrl/full/seed_0",
@@ -37,6 +38,8 @@ def build_parser() -> Parser:
     parser = Parser("sb3_tbc.train", EXAMPLES, description=__doc__)
     what = parser.add_argument_group("what to train")
     what.add_argument("--list", action=ListAction, help="print tasks, steps, minutes, extras and algorithms, and stop")
+    what.add_argument("--help-settings", action="store_true", help="print every setting of --algo that --hyperparams "
+                      "and configuration files take, and stop")  # fmt: skip
     what.add_argument("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
     what.add_argument("--env", default="Pendulum", help="a task's name or the id of any registered goal environment")
     what.add_argument("--seed", type=int, default=0, help="seed of everything random in the run")
@@ -161,6 +164,9 @@ def _python() -> str:
 def command(argv: Sequence[str]) -> int:
     """Train; see ``--help``."""
     args = build_parser().parse_args(argv)
+    if args.help_settings:
+        print(settings_text(args.algo.lower()))
+        return 0
     if args.tensorboard:  # told before the run's folder is made
         require("tensorboard", extra="plots", what="--tensorboard")
     with stop_request() as stop:

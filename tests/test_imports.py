@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import graphlib
 import subprocess
 import sys
 from pathlib import Path
@@ -100,6 +101,15 @@ def test_imports_point_downwards(name: str) -> None:
     for imported in imports(name, everywhere=True):
         if imported.startswith("sb3_tbc.") and place(imported) != place(name):
             assert LAYER[place(imported)] < LAYER[place(name)], f"{name} must not import {imported}"
+
+
+def test_modules_do_not_import_each_other_in_a_circle() -> None:
+    """Imports inside functions and for type checking count: whoever reads one module of a circle has to read all."""
+    graph = {name: {i for i in imports(name, everywhere=True) if i in MODULES and i != name} for name in MODULES}
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as circle:
+        pytest.fail(f"a circle of imports: {' <- '.join(circle.args[1])}")
 
 
 def test_every_folder_has_a_layer() -> None:

@@ -12,7 +12,7 @@ import inspect
 import os
 import typing
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar
 
 import torch as th
@@ -81,26 +81,26 @@ class HierarchyArguments(SB3Arguments):
     """Subgoal space, for environments that do not bring one."""
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class TBCArguments(AgentConfig, HierarchyArguments):
-    """Keyword arguments of :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`."""
+    """All that :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL` takes."""
 
-    high: HighConfig | Mapping[str, Any] | None = None
-    low: LowConfig | Mapping[str, Any] | None = None
+    policy: str | type[BasePolicy]
+    env: GymEnv | str | None
+    high: HighConfig | Mapping[str, Any] | None = field(default=None, kw_only=True)
+    low: LowConfig | Mapping[str, Any] | None = field(default=None, kw_only=True)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class FlatArguments(FlatConfig, SB3Arguments):
-    """Keyword arguments of :class:`~sb3_tbc.tbc_hrl.flat_sac.FlatSAC`."""
+    """All that :class:`~sb3_tbc.tbc_hrl.flat_sac.FlatSAC` takes."""
+
+    policy: str | type[BasePolicy]
+    env: GymEnv | str
 
 
-def takes(
-    arguments: Callable[P, Settings],
-) -> Callable[
-    [Callable[..., None]],
-    Callable[Concatenate[Any, str | type[BasePolicy], GymEnv | str | None, P], None],
-]:
-    """Tell type checkers that a constructor takes ``policy``, ``env`` and the fields of ``arguments`` by name."""
+def takes(arguments: Callable[P, Settings]) -> Callable[[Callable[..., None]], Callable[Concatenate[Any, P], None]]:
+    """Tell type checkers that a constructor takes what ``arguments`` does."""
     return lambda constructor: constructor
 
 

@@ -13,7 +13,6 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
-import sb3_tbc  # noqa: F401  (registers the tasks)
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly

@@ -1,30 +1,22 @@
-"""Settings as frozen dataclasses: each field says what it may hold, and checks, plain data and texts follow from that.
-
-A field is declared once, with its type, its default and a docstring below it::
-
-    gamma: Annotated[float, Range(0, 1)] = 0.99
-    \"\"\"Discount per decision.\"\"\"
-
-Types may be ``bool, int, float, str``, a ``Literal``, a ``tuple``, a ``dict``, any class, another settings dataclass,
-and unions of these; numbers have to be finite. Nothing here knows which settings there are.
-"""
+"""Settings classes: every field is checked when they are made, and they know their plain data."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import itertools
 import math
 import numbers
 import types
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, Protocol, TypeVar, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.settings.kinds import allows_none, arms, default_of, hints, section_of, split
+from sb3_tbc.settings.texts import describe, remark, section_text
 
 SelfSettings = TypeVar("SelfSettings", bound="Settings")
+
 _WRONG = object()
 """Stands for a value of the wrong type."""
 
@@ -43,103 +35,6 @@ class SettingError(ConfigError):
     def inside(self, section: str) -> SettingError:
         """The same mistake, seen from outside of a section."""
         return SettingError(_dotted(section, self.name), self.text)
-
-
-class Domain(Protocol):
-    """What a value of the right type has to fulfil besides."""
-
-    def holds(self, value: Any) -> bool:
-        """Whether the value is allowed."""
-
-    def __str__(self) -> str:
-        """What is allowed, to be read after the type's name."""
-
-
-@dataclass(frozen=True)
-class Range:
-    """Numbers between two bounds, which are allowed themselves unless excluded.
-
-    :param low: lower bound
-    :param high: upper bound
-    :param above: exclude the lower bound
-    :param below: exclude the upper bound
-    :param also: single values outside of the bounds that are allowed as well
-    """
-
-    low: float = -math.inf
-    high: float = math.inf
-    above: bool = False
-    below: bool = False
-    also: tuple[float, ...] = ()
-
-    def holds(self, value: Any) -> bool:
-        """Whether a number lies within the bounds."""
-        low = value > self.low if self.above else value >= self.low
-        high = value < self.high if self.below else value <= self.high
-        return bool((low and high) or value in self.also)
-
-    def __str__(self) -> str:
-        low, high = _short(self.low), _short(self.high)
-        parts = []
-        if self.low > -math.inf:
-            parts.append(f"above {low}" if self.above else f"of at least {low}")
-        if self.high < math.inf:
-            parts.append(f"below {high}" if self.below else f"at most {high}")
-        text = " and ".join(parts)
-        if len(parts) == 2 and not (self.above or self.below):
-            text = f"from {low} to {high}"
-        return " or ".join([text, *map(_short, self.also)])
-
-
-def _short(number: float) -> str:
-    return f"{int(number):,}" if float(number).is_integer() else f"{number:g}"
-
-
-@dataclass(frozen=True)
-class Prefixed:
-    """Text made of a fixed beginning and a number, such as ``lin_3e-4``.
-
-    :param prefix: the beginning
-    :param number: bounds of the number
-    """
-
-    prefix: str
-    number: Range
-
-    def holds(self, value: Any) -> bool:
-        """Whether a text has this form."""
-        try:
-            number = float(str(value).removeprefix(self.prefix))
-        except ValueError:
-            return False
-        return str(value).startswith(self.prefix) and math.isfinite(number) and self.number.holds(number)
-
-    def __str__(self) -> str:
-        return f"'{self.prefix}<number {self.number}>'"
-
-
-@dataclass(frozen=True)
-class Increasing:
-    """Numbers of which each is larger than the one before it."""
-
-    def holds(self, value: Any) -> bool:
-        """Whether a sequence rises."""
-        return all(a < b for a, b in itertools.pairwise(value))
-
-    def __str__(self) -> str:
-        return "in rising order"
-
-
-@dataclass(frozen=True)
-class NotEmpty:
-    """Lists of at least one entry."""
-
-    def holds(self, value: Any) -> bool:
-        """Whether a sequence has entries."""
-        return len(value) > 0
-
-    def __str__(self) -> str:
-        return "that is not empty"
 
 
 @dataclass(frozen=True)
@@ -185,23 +80,6 @@ def plain(value: Any) -> Any:
     return value
 
 
-def hints(section: type[Any]) -> dict[str, Any]:
-    """Name of every field of a settings class and its type, domains included."""
-    key: Any = section
-    return _hints(key)
-
-
-@functools.cache
-def _hints(section: type[Any]) -> dict[str, Any]:
-    found = typing.get_type_hints(section, include_extras=True)
-    return {field.name: found[field.name] for field in dataclasses.fields(section)}
-
-
-def default_of(field: dataclasses.Field[Any]) -> Any:
-    """A field's default value."""
-    return field.default if field.default_factory is dataclasses.MISSING else field.default_factory()
-
-
 # ------------------------------------------------------------------------------------------------- checking
 
 
@@ -225,32 +103,8 @@ def read(value: Any, hint: Any, name: str, default: Any = None, partial: bool = 
     else:
         result = _read_plain(value, kind, name)
     if result is _WRONG or not all(domain.holds(result) for domain in domains):
-        raise SettingError(name, f"must be {describe(hint)}, got {value!r}{_remark(value, kind)}")
+        raise SettingError(name, f"must be {describe(hint)}, got {value!r}{remark(value, kind)}")
     return result
-
-
-def split(hint: Any) -> tuple[Any, tuple[Domain, ...]]:
-    """A type without and with what restricts it."""
-    if get_origin(hint) is Annotated:
-        kind, *domains = get_args(hint)
-        return kind, tuple(domains)
-    return hint, ()
-
-
-def allows_none(kind: Any) -> bool:
-    """Whether None is a value of its own for a type."""
-    return kind is Any or kind is type(None) or any(arm is type(None) for arm in arms(kind))
-
-
-def arms(kind: Any) -> tuple[Any, ...]:
-    """The alternatives of a union; of another type none."""
-    return get_args(kind) if get_origin(kind) in (typing.Union, types.UnionType) else ()
-
-
-def section_of(hint: Any) -> type[Any] | None:
-    """The settings class that a type stands for or allows, None if it has none."""
-    kind = split(hint)[0]
-    return next((arm for arm in (kind, *arms(kind)) if dataclasses.is_dataclass(arm) and isinstance(arm, type)), None)
 
 
 def read_partial(given: Any, kinds: Mapping[str, Any], where: str = "") -> dict[str, Any]:
@@ -268,7 +122,7 @@ def read_partial(given: Any, kinds: Mapping[str, Any], where: str = "") -> dict[
 
 def _check_names(given: Any, kinds: Mapping[str, Any], where: str) -> None:
     if not isinstance(given, Mapping):
-        raise SettingError(where, f"must be {_section_text(kinds)}, got {given!r}")
+        raise SettingError(where, f"must be {section_text(kinds)}, got {given!r}")
     for name in given:
         if name not in kinds:
             raise SettingError("", f"unknown setting {_dotted(where, str(name))!r}; {nearest(str(name), kinds)}")
@@ -351,48 +205,3 @@ def _read_dict(value: Any, kind: Any, name: str) -> Any:
 
 def _dotted(section: str, name: str) -> str:
     return ".".join(part for part in (section, name) if part)
-
-
-# ------------------------------------------------------------------------------------------------- texts
-
-_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "none"}
-
-
-def describe(hint: Any) -> str:
-    """What a type allows, in words: ``a number from 0 to 1``."""
-    kind, domains = split(hint)
-    if any(isinstance(domain, Prefixed) for domain in domains):
-        return " and ".join(str(domain) for domain in domains)
-    return " ".join([_describe_kind(kind), *(str(domain) for domain in domains)])
-
-
-def _describe_kind(kind: Any) -> str:
-    origin = get_origin(kind)
-    if kind is Any:
-        return "anything"
-    if arms(kind):
-        return " or ".join(describe(arm) for arm in arms(kind))
-    if origin is Literal:
-        choices = ", ".join(map(repr, get_args(kind)))
-        return choices if len(get_args(kind)) == 1 else f"one of {choices}"
-    if origin is tuple:
-        entries = get_args(kind)
-        several = entries[-1] is Ellipsis
-        return f"a list (each entry {describe(entries[0])})" if several else f"a list of {len(entries)} numbers"
-    if origin is dict:
-        return f"a section (each entry {describe(get_args(kind)[1])})"
-    if origin is type:
-        return f"a class derived from {get_args(kind)[0].__name__}"
-    if dataclasses.is_dataclass(kind):
-        return _section_text(hints(typing.cast(type[Any], kind)))
-    return _NAMES.get(kind, f"a {getattr(kind, '__name__', kind)}")
-
-
-def _section_text(kinds: Mapping[str, Any]) -> str:
-    return f"a section with some of the keys {', '.join(kinds)}"
-
-
-def _remark(value: Any, kind: Any) -> str:
-    """Say so where a value looks right but is of another type."""
-    wants_number = kind in (int, float) or any(split(arm)[0] in (int, float) for arm in arms(kind))
-    return " (text)" if isinstance(value, str) and wants_number else ""
