@@ -85,6 +85,8 @@ def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]]) ->
     :param reference: the task's rows, of which ours is compared with
     """
     notes = differences(runs, reference[OURS]) if OURS in reference else []
+    if any(run.tuned_on for run in runs):
+        notes.append("settings were chosen on the seed that is reported")
     dirty = [run.seed for run in runs if run.versions and run.dirty]
     if dirty:
         seeds = "all seeds" if len(dirty) == len(runs) else "seed " + ", ".join(map(str, dirty))

@@ -18,8 +18,10 @@ from sb3_tbc.report.runs import Results
 MARKS = ("<!-- results:begin -->", "<!-- results:end -->")
 
 
-def to_markdown(results: Results, descriptions: Mapping[str, Mapping[str, str]], paper: Paper) -> str:
-    """All tables, with what each row is; empty tables are left out."""
+def to_markdown(
+    results: Results, descriptions: Mapping[str, Mapping[str, str]], paper: Paper, missing: tables.Table
+) -> str:
+    """All tables, with what each row is and which planned runs are missing; empty tables are left out."""
     sections = [
         ("Shipped settings beside the paper", tables.paper_table(results, paper), f"Paper: {paper.source}."),
         ("Against every baseline", tables.comparison_table(against_baselines(results)), tables.COMPARISON_NOTES),
@@ -32,6 +34,7 @@ def to_markdown(results: Results, descriptions: Mapping[str, Mapping[str, str]],
         ),
         ("All tasks together", tables.overall_table(results), "Shipped settings; seeds are resampled within tasks."),
         ("All rows", tables.success_table(results), tables.NOTES),
+        ("Planned and missing", missing, "Planned runs that are not in the ledger, and the command that makes them."),
         ("How far seeds lie apart", tables.spread_table(results), "Final success of rows with three seeds or more."),
     ]
     parts = [f"## {title}\n\n{_said(note)}{tables.to_text(table)}" for title, table, note in sections if len(table) > 1]

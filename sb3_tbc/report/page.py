@@ -16,7 +16,7 @@ from sb3_tbc.report.paper import Figure, Paper
 from sb3_tbc.report.runs import Results, Run, describe, is_shipped
 from sb3_tbc.report.timeline import TRACE, last_episode, option_timeline
 
-TEXT_COLUMNS = ("what it is", "notes", "note", "differs from ours in", "evidence", "machine", "verdict")
+TEXT_COLUMNS = ("what it is", "notes", "note", "differs from ours in", "evidence", "machine", "verdict", "command")
 INTRODUCTION = (
     "Rows without a further name have the shipped settings. Lines are means over seeds, bands their 95 % bootstrap "
     "intervals, dots every measured evaluation. Point at a curve to read it, at a name to bring its line out."
@@ -24,7 +24,12 @@ INTRODUCTION = (
 
 
 def to_html(
-    results: Results, descriptions: Mapping[str, Mapping[str, str]], paper: Paper, failed: Sequence[Path], out: Path
+    results: Results,
+    descriptions: Mapping[str, Mapping[str, str]],
+    paper: Paper,
+    failed: Sequence[Path],
+    missing: Sequence[Sequence[str]],
+    out: Path,
 ) -> str:
     """The whole page.
 
@@ -32,6 +37,7 @@ def to_html(
     :param descriptions: what the rows are
     :param paper: the paper's figures
     :param failed: folders of runs that ended in an error
+    :param missing: table of planned runs that the ledger lacks
     :param out: where the page will lie, for links to films
     """
     style, script = (_template(name) for name in ("page.css", "page.js"))
@@ -53,6 +59,7 @@ def to_html(
         *_section(
             "How far seeds lie apart", tables.spread_table(results), "Final success, rows of three seeds or more."
         ),
+        *_section("Planned and missing", missing, ""),
         "<h2>How each row was made</h2>",
         *_rows(results, descriptions),
         *_films(results, out),
@@ -77,10 +84,10 @@ def _heading(results: Results, failed: Sequence[Path]) -> list[str]:
     runs = [run for methods in results.values() for rows in methods.values() for run in rows]
     hours = sum(float(run.final.get("wall_time") or 0.0) for run in runs) / 3600
     dirty = sum(run.dirty for run in runs if run.versions)
-    facts = [f"{len(runs)} finished runs on {len(results)} tasks", f"{hours:.1f} hours of training"]
-    facts.append(f"{len(failed)} failed runs" if failed else "no failed runs")
+    facts = [f"{_count(len(runs), 'finished run')} on {_count(len(results), 'task')}", f"{hours:.1f} hours of training"]
+    facts.append(_count(len(failed), "failed run") if failed else "no failed runs")
     if dirty:
-        facts.append(f"{dirty} runs from code with changes that were not committed, marked below")
+        facts.append(f"{_count(dirty, 'run')} from code with changes that were not committed, marked below")
     names = ", ".join(escape("/".join(path.parts[-4:])) for path in failed)
     return [
         "<h1>Results</h1>",
@@ -90,6 +97,10 @@ def _heading(results: Results, failed: Sequence[Path]) -> list[str]:
         '<p class="bar"><label><input type="checkbox" id="variants" disabled> show variants and ablations</label>'
         '<button id="theme" type="button" hidden>light or dark</button></p>',
     ]
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _figures(results: Results, descriptions: Mapping[str, Mapping[str, str]], paper: Paper) -> list[str]:

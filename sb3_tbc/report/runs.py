@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -21,6 +21,8 @@ SHIPPED = "full"
 """Variant of runs with the shipped settings; runs of any other variant are never a baseline."""
 DESCRIPTIONS = "descriptions.yml"
 """In the folder of results: task -> method -> one line; under ``default``: variant -> one line."""
+TUNING_SEEDS = "tuning_seeds.yml"
+"""In the folder of results: task -> method -> seeds on which the row's settings were chosen."""
 
 
 class Curve(NamedTuple):
@@ -39,6 +41,7 @@ class Run(NamedTuple):
     command: str = ""
     versions: Mapping[str, Any] = MappingProxyType({})
     folder: Path = Path()
+    tuned_on: bool = False  # settings of its row were chosen on this seed
 
     @property
     def method(self) -> str:
@@ -85,6 +88,8 @@ Results = dict[str, dict[str, list[Run]]]
 def load_results(root: Path) -> Results:
     """All finished runs below a folder.
 
+    Seeds on which settings were chosen are left out where their row has others: they would flatter it.
+
     :raises ConfigError: if there is none or one cannot be read
     """
     results: Results = defaultdict(lambda: defaultdict(list))
@@ -96,10 +101,18 @@ def load_results(root: Path) -> Results:
             raise ConfigError(f"cannot read the run in {folder.path}: {error}") from error
     if not results:
         raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
+    tuned = _read_table(root / TUNING_SEEDS)
     return {
-        task: {m: sorted(methods[m], key=lambda run: run.seed) for m in sorted(methods, key=_rank)}
+        task: {m: _reported(methods[m], tuned.get(task, {}).get(m, ())) for m in sorted(methods, key=_rank)}
         for task, methods in sorted(results.items())
     }
+
+
+def _reported(runs: Sequence[Run], tuned_on: Iterable[int]) -> list[Run]:
+    """Runs of a row in order of their seeds, those that settings were chosen on only where there are no others."""
+    chosen = set(tuned_on)
+    marked = [run._replace(tuned_on=run.seed in chosen) for run in sorted(runs, key=lambda run: run.seed)]
+    return [run for run in marked if not run.tuned_on] or marked
 
 
 def _load(folder: RunFolder) -> Run:
@@ -146,12 +159,19 @@ def load_descriptions(root: Path) -> dict[str, dict[str, str]]:
 
     :raises ConfigError: if the file cannot be read
     """
-    path = root / DESCRIPTIONS
+    return {task: {k: str(v) for k, v in lines.items()} for task, lines in _read_table(root / DESCRIPTIONS).items()}
+
+
+def _read_table(path: Path) -> dict[str, dict[str, Any]]:
+    """A YAML file of two levels, empty where there is none.
+
+    :raises ConfigError: if it cannot be read
+    """
     if not path.is_file():
         return {}
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return {str(task): {str(k): str(v) for k, v in lines.items()} for task, lines in data.items()}
+        return {str(task): {str(k): v for k, v in lines.items()} for task, lines in data.items()}
     except (OSError, yaml.YAMLError, AttributeError) as error:
         raise ConfigError(f"cannot read {path}: {error}") from error
 

@@ -159,7 +159,8 @@ def spread_table(results: Results) -> Table:
 def overall_table(results: Results) -> Table:
     """Interquartile mean of all runs with shipped settings, over the tasks that a method has runs of."""
     table = [["method", "tasks", "runs", "interquartile mean", "95 % interval"]]
-    names = list(dict.fromkeys(method for methods in results.values() for method in shipped(methods)))
+    several = len(results) > 1
+    names = list(dict.fromkeys(m for methods in results.values() for m in shipped(methods))) if several else []
     for method in names:
         rows = [methods[method] for methods in results.values() if method in methods]
         iqm = stats.interquartile_mean([successes(runs) for runs in rows])

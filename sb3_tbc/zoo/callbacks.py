@@ -208,7 +208,7 @@ class OptionTraceCallback(BaseCallback):
                 continue
             self._seen += 1
             if self._seen % self.every == 0:
-                self._write(index, option, bool(info.get("episode_over")))
+                self._write(index, option, index in self.locals.get("episodes", {}))
         return True
 
     def _write(self, index: int, option: dict[str, Any], episode_over: bool) -> None:

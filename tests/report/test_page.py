@@ -169,7 +169,7 @@ def test_failed_runs_are_counted_and_named(ledger: Path, tmp_path: Path, capsys:
     page = tmp_path / "page.html"
     assert report.main([str(ledger), "--html", str(page)]) == 0
     assert "failed         " in capsys.readouterr().out
-    assert "1 failed runs" in page.read_text()
+    assert "1 failed run" in page.read_text()
     assert "Pendulum/sac/full/seed_0" in page.read_text()
 
 

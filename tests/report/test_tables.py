@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,9 @@ from sb3_tbc.report.comparisons import (
 )
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.paper import load_paper
+from sb3_tbc.report.planned import missing_table
 from sb3_tbc.report.runs import Curve, describe, load_descriptions, load_results, on_union_of_steps
+from sb3_tbc.reproduce import jobs
 
 ROOT = Path(__file__).parents[2]
 
@@ -57,8 +60,10 @@ def test_seeds_that_all_succeed_leave_some_doubt(tmp_path: Path) -> None:
     for seed in range(5):
         fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0)
     assert row_of(tmp_path, "tbc-hrl")["95 % interval"] == "0.993 to 1.000"
+    fake_run(tmp_path, "B", "tbc-hrl", 0, 1.0)
     overall = tables.overall_table(load_results(tmp_path))[1]
-    assert overall[-1] == "0.985 to 1.000"
+    assert overall[:4] == ["tbc-hrl", "2", "6", "1.000"]
+    assert overall[-1] == "0.988 to 1.000"
 
 
 def test_variants_and_ablations_never_are_baselines(tmp_path: Path) -> None:
@@ -179,6 +184,44 @@ def test_rows_say_which_seeds_are_from_uncommitted_code(tmp_path: Path) -> None:
         "environments: 1 or 2, depending on the seed",
         "seed 1: code with changes that were not committed",
     ]
+
+
+def test_tuning_seeds_are_left_out_or_named(tmp_path: Path) -> None:
+    for seed, rate in ((0, 1.0), (100, 0.6), (101, 0.8)):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, rate)
+    fake_run(tmp_path, "A", "hits", 0, 0.5)
+    (tmp_path / "tuning_seeds.yml").write_text("A: {tbc-hrl: [0], hits: [0]}")
+    methods = load_results(tmp_path)["A"]
+    assert [run.seed for run in methods["tbc-hrl"]] == [100, 101]
+    assert row_of(tmp_path, "tbc-hrl")["success"] == "0.700"
+    assert "settings were chosen on the seed that is reported" in notes_of_row(methods["hits"], methods)
+    assert notes_of_row(methods["tbc-hrl"], methods) == []
+
+
+def test_missing_runs_come_with_a_command_that_is_understood(tmp_path: Path) -> None:
+    for seed in (0, 100):
+        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0)
+    fake_run(tmp_path, "Pendulum", "hits", 100, 1.0)
+    rows = "{task: Pendulum, seeds: 2, n_timesteps: 500, methods: [tbc-hrl, tbc-hrl no-ts, tbc-hrl full-paper]}"
+    rows += ", {task: Pendulum, seeds: 1, methods: [hits]}"
+    (tmp_path / "campaign.yml").write_text(f"first_seed: 100\noptions: [--n-eval-episodes, 100]\nruns: [{rows}]")
+    _, *missing = missing_table(tmp_path, load_results(tmp_path))
+    assert [row[:3] for row in missing] == [
+        ["Pendulum", "tbc-hrl", "1 of 2"],
+        ["Pendulum", "tbc-hrl no-ts", "0 of 2"],
+        ["Pendulum", "tbc-hrl full-paper", "0 of 2"],
+    ]
+    variants = []
+    for row in missing:
+        planned = list(jobs(shlex.split(row[3])[3:]))
+        assert [job.seed for job in planned] == [100, 101]
+        assert {job.n_timesteps for job in planned} == {500}
+        assert "--n-eval-episodes" in planned[0].arguments
+        variants.append(planned[0].target.path.parent.name)
+    assert variants == ["full", "no-ts", "full-paper"]
+    (tmp_path / "campaign.yml").write_text("runs: 3")
+    with pytest.raises(ConfigError, match="cannot read the plan"):
+        missing_table(tmp_path, load_results(tmp_path))
 
 
 def test_no_extreme_is_lost_between_seeds_of_other_steps() -> None:

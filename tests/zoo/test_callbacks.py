@@ -126,12 +126,13 @@ def test_option_trace(agent: Agent, tmp_path: Path) -> None:
     for duration in range(4):
         option = {"subgoal": np.array([1.5, -2.0]), "time_budget": 9.5, "duration": duration}
         infos = [{}, {"option": {**option, "reached": True, "reason": "reached"}}]
-        callback.update_locals({"infos": infos})
+        callback.update_locals({"infos": infos, "episodes": {1: "an episode"} if duration == 3 else {}})
         steps(callback, agent, agent.num_timesteps + 1)
     callback.on_training_end()
     with (tmp_path / "options.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["duration"] for row in rows] == ["1", "3"]
+    assert [row["episode_over"] for row in rows] == ["0", "1"]
     assert rows[0] == {
         "timesteps": "2",
         "env": "1",
