@@ -78,7 +78,10 @@ def _check_members(archive: zipfile.ZipFile, size: int, name: str) -> None:
     names = [member.filename for member in members]
     for member in members:
         if not NAME.fullmatch(member.filename) or member.flag_bits & 1:
-            raise ConfigError(f"{name} holds {one_line(repr(member.filename))}, which no agent holds")
+            raise ConfigError(
+                f"{name} is not a complete agent .zip (truncated or another format): it holds "
+                f"{one_line(repr(member.filename))}, which no agent holds"
+            )
     if len(members) > MAX_MEMBERS or len(set(names)) < len(names):
         raise ConfigError(f"{name} holds {len(members)} files, some of them twice; no agent does")
     if sum(member.file_size for member in members) > MAX_GROWTH * size + SMALL:
