@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
+from sb3_tbc import TBCHRL
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import RunConfig, config_file, load_config, merge, parse_overrides, read_file
@@ -93,6 +95,45 @@ def test_wiring_is_table_a1(task: str) -> None:
     # `tuned` may depart in the fans, and has larger circuits for the ant's eight motors and for the racket
     layers = ("motor",) if task in ("AntFourRooms", "Tennis2D") else ("inter", "command", "motor")
     assert {k: tuned[k] for k in layers} == {k: table[k] for k in layers}
+
+
+@pytest.mark.parametrize("task", [*TASKS, "Other-v0"])
+def test_paper_is_what_the_text_says(task: str) -> None:
+    model = load_config("tbc-hrl", task, "paper").model
+    said = {
+        "window_end": "reached",  # algorithm 1, line 20
+        "duration": "joint",  # section 4.1
+        "low_reward": "dense",  # section 4.1: "updated at every step"
+        "target": "smdp",
+        "memory": "window",
+        "keep_original": True,  # algorithm 1, lines 26 and 30
+        "relabel_tolerance": 0.05,  # section 4.2
+        "completion_bonus": 1.0,  # sections 4.2 and 4.5
+        "duration_cost": 0.0,
+    }
+    assert {name: model[name] for name in said} == said
+    assert model["duration_loss_coef"] > 0  # section 4.2; what makes kappa count
+    assert model["low"]["policy_kwargs"]["ndbc"]["adaptive_step"] is True  # equation 17
+    assert model["low"]["average_decay"] == model["high"]["average_decay"] == 0
+
+
+def test_kappa_has_an_effect_in_the_paper_configuration() -> None:
+    """What the duration loss draws time budgets toward is in proportion to kappa (equation 1)."""
+    budgets = []
+    for kappa in (0.6, 1.2):
+        run = load_config("tbc-hrl", "Pendulum", "paper", parse_overrides(["compile:false", f"kappa:{kappa}"]))
+        env = make_envs(task_names()["Pendulum"], 1, 0, run.env_kwargs)
+        try:
+            model, seen = build_model(run, env, seed=0), env.reset()
+        finally:
+            env.close()
+        assert isinstance(model, TBCHRL)
+        assert model.high.label_coef == run.model["duration_loss_coef"] > 0
+        teacher, subgoals = model.replay_buffer.high.teacher, model.layout.subgoals
+        assert teacher is not None
+        local, here = subgoals.local(seen).astype(np.float32), subgoals.achieved(seen).astype(np.float32)
+        budgets.append(model.rules.budget(teacher(model.layout.high(seen), local, here)))
+    np.testing.assert_allclose(budgets[1], 2 * budgets[0], rtol=1e-5)
 
 
 def test_paper_reading_of_the_window_end() -> None:
