@@ -47,7 +47,7 @@ RECIPES = {
     "UR5Reacher": Recipe(
         150_000, "It was tried on the task's own goals alone: pan beyond 45 degrees, lift and elbow within 45 degrees."
     ),
-    "Platforms": Recipe(1_500_000, "Starts are always the same; only the goal's place on the ledge varies."),
+    "Platforms": Recipe(500_000, "Starts are always the same; only the goal's place on the ledge varies."),
     "AntFourRooms": Recipe(1_000_000, "Runs with other seeds learn sooner or later than this one."),
 }
 
