@@ -17,6 +17,7 @@ EXAMPLES = {
     "sb3_tbc.benchmark train Pendulum": "training speed beside SB3's SAC, and where the time goes",
     "sb3_tbc.benchmark cells --json cells.json": "the circuit beside LTC, CfC and GRU",
     "sb3_tbc.benchmark parameters": "sizes of the circuits of table A1",
+    "sb3_tbc.benchmark fit --tasks Pendulum --actors lean mlp --steps 500 2000": "what actors learn by imitation",
 }
 JSON_HELP = "write the figures to this file, too"
 
@@ -30,6 +31,7 @@ def build_parser() -> Parser:
     parameters = commands.add_parser("parameters", help="parameter counts of table A1's circuits beside their MLPs")
     parameters.add_argument("--json", metavar="OUT", help=JSON_HELP)
     _add_train(commands)
+    _add_fit(commands)
     return parser
 
 
@@ -41,6 +43,27 @@ def _add_cells(commands: Any) -> None:
     cells.add_argument("--compile", action="store_true", help="also the compiled network (takes minutes to compile)")
     cells.add_argument("--no-growth", action="store_true", help="skip the curves over synapses, time and K")
     cells.add_argument("--json", metavar="OUT", help=JSON_HELP)
+
+
+def _add_fit(commands: Any) -> None:
+    fit = commands.add_parser("fit", help="how fast and how well actors learn recorded skills and delays by imitation")
+    fit.add_argument("--tasks", nargs="+", metavar="SKILL", help="tasks that have a recording, and delay3, delay10, "
+                     "delay30 or another delay; by default all of these")  # fmt: skip
+    fit.add_argument("--actors", nargs="+", metavar="ACTOR", default=["paper", "lean", "lean,reflex", "mlp"],
+                     help="paper: table A1's circuit; lean: the same with lean synapses; either with options after "
+                     "commas: reflex, full (fans), slow (command neurons), gains (of 6 to 12), inter=48, sub_steps=6, "
+                     "...; mlp: an MLP of as many parameters as table A1's circuit, mlp:64x64x64 of these widths, "
+                     "mlp:1300 of so many parameters; gru:16; a rate of its own as lean,rate=3e-2. By default paper, "
+                     "lean, lean,reflex and mlp")  # fmt: skip
+    fit.add_argument("--steps", nargs="+", type=positive_int, default=[500, 1000, 2000, 8000], metavar="N",
+                     help="Adam steps after which to judge; by default 500, 1000, 2000 and 8000")  # fmt: skip
+    fit.add_argument("--seeds", type=positive_int, default=1, help="networks of each actor; figures are their mean")
+    fit.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    record = commands.add_parser("record", help="record the low level of a trained agent as a skill for fit")
+    record.add_argument("model", metavar="MODEL.zip", help="an agent whose low level is an MLP (hits, or no-ndbc)")
+    record.add_argument("--out", metavar="OUT.npz", help="by default the task's file among the package's skills")
+    record.add_argument("--every", type=positive_int, default=3, help="take every so many steps")
+    record.add_argument("--json", metavar="OUT", help=JSON_HELP)
 
 
 def _add_train(commands: Any) -> None:
@@ -70,16 +93,31 @@ def benchmark(argv: Sequence[str]) -> int:
 
 
 def _measure(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
-    from sb3_tbc.benchmark import cells as benchmark_cells
-
     if arguments.subject == "cells":
+        from sb3_tbc.benchmark import cells as benchmark_cells
+
         return benchmark_cells.cells(arguments)
+    if arguments.subject == "fit":
+        from sb3_tbc.benchmark import fit as benchmark_fit
+
+        return benchmark_fit.fit(arguments)
+    if arguments.subject == "record":
+        return _record(arguments)
     if arguments.subject == "train":
         from sb3_tbc.benchmark import training as benchmark_train
 
         return benchmark_train.train(arguments)
     require("Box2D", extra="box2d", what="benchmark parameters")  # for the sizes of Platforms and Tennis2D
-    return benchmark_cells.parameters()
+    from sb3_tbc.benchmark.circuits import parameters
+
+    return parameters()
+
+
+def _record(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
+    from sb3_tbc.benchmark.skills import record_file
+
+    written = record_file(Path(arguments.model), Path(arguments.out) if arguments.out else None, arguments.every)
+    return [f"recording      {written} ({written.stat().st_size / 1e6:.2f} MB)"], {"recording": str(written)}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -9,7 +11,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional
 
-from sb3_tbc.ndbc.wiring import NDBCWiring
+from sb3_tbc.ndbc.wiring import LAYERS, NDBCWiring
 
 INITIAL_RANGES = {
     "conductance": (0.1, 0.6),
@@ -75,6 +77,32 @@ def inverse_softplus(value: th.Tensor) -> th.Tensor:
     return value + th.log(-th.expm1(-value))
 
 
+def checked_time_constants(ranges: Mapping[str, Sequence[float] | None] | None) -> dict[str, tuple[float, float]]:
+    """Ranges of time constants by layer, without the layers that have none.
+
+    :raises ValueError: for another layer, or what is no range of positive numbers
+    """
+    checked = {}
+    for layer, given in (ranges or {}).items():
+        if layer not in LAYERS:
+            raise ValueError(f"time_constants has ranges for {LAYERS}, got {layer!r}; sensory neurons have no state")
+        if given is not None:
+            checked[layer] = positive_range(f"time_constants[{layer!r}]", given)
+    return checked
+
+
+def positive_range(name: str, given: Sequence[float]) -> tuple[float, float]:
+    """Lower and upper end of a range of positive numbers.
+
+    :param name: names the range in messages
+    :raises ValueError: for anything else
+    """
+    pair = tuple(float(x) for x in given)
+    if len(pair) != 2 or not 0.0 < pair[0] <= pair[1] < math.inf:
+        raise ValueError(f"{name} must be [low, high] with 0 < low <= high, got {list(given)}")
+    return pair[0], pair[1]
+
+
 def uniform(size: int, low: float, high: float, generator: th.Generator | None) -> th.Tensor:
     """Uniform numbers in ``[low, high)``, from torch's global stream if there is no generator."""
     return low + (high - low) * th.rand(size, generator=generator)
@@ -95,10 +123,25 @@ class ConductanceCell(nn.Module):
 
     :param wiring: who is wired to whom, with polarities
     :param generator: source of the initial values; torch's global one if None
+    :param time_constants: range of the initial time constants of each layer named, in control steps, drawn
+        log-uniformly; the capacitance is then the exponential of a free parameter, so that training changes slow
+        neurons by the same factors as fast ones. Other layers, and all by default, draw capacitances as
+        :data:`INITIAL_RANGES` says
+    :param initial_gains: range of the initial gains of all logistics, by default that of :data:`INITIAL_RANGES`
+    :raises ValueError: if a layer or a range is not possible
     """
 
-    def __init__(self, wiring: NDBCWiring, generator: th.Generator | None = None) -> None:
+    def __init__(
+        self,
+        wiring: NDBCWiring,
+        generator: th.Generator | None = None,
+        time_constants: Mapping[str, Sequence[float] | None] | None = None,
+        initial_gains: Sequence[float] | None = None,
+    ) -> None:
         super().__init__()
+        ranges = checked_time_constants(time_constants)
+        self._gains = positive_range("initial_gains", initial_gains or INITIAL_RANGES["gain"])
+        self.log_capacitance = bool(ranges)
         self.n_inputs, self.n_driven, self.n_neurons = wiring.n_inputs, wiring.n_driven, wiring.n_neurons
         self.n_presynaptic = int(np.flatnonzero(wiring.recurrent.any(axis=1)).max(initial=0)) + 1
         self.polarity: th.Tensor
@@ -106,6 +149,24 @@ class ConductanceCell(nn.Module):
         self.current_index: th.Tensor
         self._index_synapses(wiring)
         self._draw_parameters(generator)
+        if ranges:
+            self._draw_time_constants(wiring, ranges, generator)
+
+    @th.no_grad()
+    def _draw_time_constants(
+        self, wiring: NDBCWiring, ranges: Mapping[str, tuple[float, float]], generator: th.Generator | None
+    ) -> None:
+        """Capacitances for time constants in ``ranges``: ``C = tau x conductance``, with every logistic half open."""
+        capacitance = functional.softplus(self.raw_capacitance)
+        arrays = self._assemble(self.values(), self.synapse_currents())
+        s, n = self.n_sensory_synapsing, self.n_neurons
+        released = arrays.from_inputs[:s, n:].sum(dim=0) + arrays.recurrent[:, n:].sum(dim=0)
+        conductance = arrays.rest[n:] + 0.5 * released
+        for name, (low, high) in ranges.items():
+            layer = wiring.layer(name)
+            drawn = uniform(layer.stop - layer.start, math.log(low), math.log(high), generator).exp()
+            capacitance[layer] = drawn * conductance[layer]
+        self.raw_capacitance.copy_(capacitance.log())
 
     @property
     def n_sensory_synapsing(self) -> int:
@@ -119,12 +180,15 @@ class ConductanceCell(nn.Module):
         self.raw_input_conductance = positive_parameter(m, "input_conductance", generator)
         self.raw_capacitance = positive_parameter(n, "capacitance", generator)
         self.raw_leak = positive_parameter(n, "leak", generator)
-        self.raw_gain = positive_parameter(self.n_presynaptic, "gain", generator)
-        self.raw_sensory_gain = positive_parameter(inputs, "gain", generator)
+        self.raw_gain = self._gain_parameter(self.n_presynaptic, generator)
+        self.raw_sensory_gain = self._gain_parameter(inputs, generator)
         self.leak_potential = nn.Parameter(uniform(n, -0.1, 0.1, generator))
         self.threshold = nn.Parameter(uniform(self.n_presynaptic, -0.5, 0.5, generator))
         self.sensory_threshold = nn.Parameter(uniform(inputs, -0.5, 0.5, generator))
         self._draw_current(generator)
+
+    def _gain_parameter(self, size: int, generator: th.Generator | None) -> nn.Parameter:
+        return nn.Parameter(inverse_softplus(uniform(size, *self._gains, generator)))
 
     def _draw_current(self, generator: th.Generator | None) -> None:
         spread = 2.0 / max(1.0, len(self.current_index) / self.n_driven) ** 0.5
@@ -154,7 +218,16 @@ class ConductanceCell(nn.Module):
             self.raw_capacitance,
         ]
         raw += [self.raw_leak, self.raw_gain, self.raw_sensory_gain]
-        return ConductanceValues(*th.split(functional.softplus(th.cat(raw)), [len(r) for r in raw]))
+        return self._scaled(ConductanceValues(*th.split(functional.softplus(th.cat(raw)), [len(r) for r in raw])))
+
+    def _scaled(self, value: ConductanceValues) -> ConductanceValues:
+        """The values with the capacitance that belongs to the form of its free parameter."""
+        return value._replace(capacitance=self.raw_capacitance.exp()) if self.log_capacitance else value
+
+    def synapse_currents(self) -> th.Tensor:
+        """``w E`` of every synapse; differentiable."""
+        value = self.values()
+        return value.conductance * value.reversal * self.polarity
 
     def reversal(self, value: ConductanceValues) -> th.Tensor:
         """Signed reversal potentials, one per synapse; differentiable."""

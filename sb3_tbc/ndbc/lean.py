@@ -49,7 +49,7 @@ class LeanCell(ConductanceCell):
         self.raw_input_conductance = positive_parameter(self.n_driven, "input_conductance", generator)
         self.raw_capacitance = positive_parameter(n, "capacitance", generator)
         self.raw_leak = positive_parameter(n, "leak", generator)
-        self.raw_gain = positive_parameter(self.n_presynaptic, "gain", generator)
+        self.raw_gain = self._gain_parameter(self.n_presynaptic, generator)
         self.leak_potential = nn.Parameter(uniform(n, -0.1, 0.1, generator))
         self.threshold = nn.Parameter(uniform(self.n_presynaptic, -0.5, 0.5, generator))
         self._draw_current(generator)
@@ -58,7 +58,7 @@ class LeanCell(ConductanceCell):
         """The positive quantities from the current free parameters; differentiable."""
         raw: list[th.Tensor] = [self.raw_input_conductance, self.raw_capacitance, self.raw_leak, self.raw_gain]
         current, capacitance, leak, gain = th.split(functional.softplus(th.cat(raw)), [len(r) for r in raw])
-        return ConductanceValues(
+        value = ConductanceValues(
             conductance=self.synapse.abs(),
             reversal=th.ones_like(self.synapse),
             input_conductance=current,
@@ -67,6 +67,7 @@ class LeanCell(ConductanceCell):
             gain=gain,
             sensory_gain=gain.new_zeros(0),
         )
+        return self._scaled(value)
 
     def reversal(self, value: ConductanceValues) -> th.Tensor:
         """Signed reversal potentials, one per synapse."""
@@ -75,6 +76,10 @@ class LeanCell(ConductanceCell):
     def arrays(self) -> ConductanceArrays:
         """Masked conductances from the current free parameters; differentiable. ``w E`` is s itself."""
         return self._assemble(self.values(), self.synapse)
+
+    def synapse_currents(self) -> th.Tensor:
+        """``w E`` of every synapse: s itself."""
+        return self.synapse
 
     def excitation(self, arrays: ConductanceArrays) -> tuple[th.Tensor, th.Tensor]:
         """Weights ``(n_inputs, M)`` and shifts ``(M,)`` of the input currents."""

@@ -45,6 +45,10 @@ class NDBCNet(nn.Module):
     :param synapses: ``"paper"``: a conductance and a reversal potential per synapse, sensory ones included; ``"lean"``:
         one parameter per synapse, and inputs act through the input current alone, see
         :class:`~sb3_tbc.ndbc.lean.LeanCell`; conductance dynamics only
+    :param time_constants: range of each layer's initial time constants in control steps, drawn log-uniformly, e.g.
+        ``{"command": (0.5, 3.0)}``; layers left out, and all by default, start at .1 to .3 and so forget within a
+        step. Neurons as slow as one likes need no more sub-steps. Conductance dynamics only
+    :param initial_gains: range of the initial gains of all logistics, by default 2 to 4; conductance dynamics only
     :raises ValueError: if sizes do not fit together or an option is unknown
 
     Derivatives of any order and ``torch.func`` (``vmap``, ``jacrev``) work on single steps; sequences have first
@@ -65,11 +69,14 @@ class NDBCNet(nn.Module):
         adaptive_step: bool | Mapping[str, Any] = False,
         seed: int | None = None,
         synapses: str = "paper",
+        time_constants: Mapping[str, Sequence[float] | None] | None = None,
+        initial_gains: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         wiring = wiring if isinstance(wiring, NDBCWiring) else NDBCWiring.from_dict(wiring)
         _check_sizes(n_inputs, n_outputs, wiring, sub_steps)
-        _check_options(dynamics, readout, max_rho, synapses)
+        only_conductance = {"time_constants": time_constants, "initial_gains": initial_gains}
+        _check_options(dynamics, readout, max_rho, synapses, only_conductance)
         scale = th.ones(n_inputs) if input_scale is None else th.as_tensor(input_scale, dtype=th.float32).clone()
         if scale.shape != (n_inputs,) or not bool((scale > 0).all()):
             raise ValueError(f"input_scale must be {n_inputs} positive numbers, got {input_scale}")
@@ -82,7 +89,8 @@ class NDBCNet(nn.Module):
         if dynamics == "dissipative":
             self.cell = DissipativeCell(wiring, generator, max_rho=max_rho)
         else:
-            self.cell = (LeanCell if synapses == "lean" else ConductanceCell)(wiring, generator)
+            kind = LeanCell if synapses == "lean" else ConductanceCell
+            self.cell = kind(wiring, generator, time_constants=time_constants, initial_gains=initial_gains)
         self._check_enforceable(max_rho)
         self.read_from = wiring.layer("motor").start if readout == "motor" else 0
         n_read = wiring.n_neurons - self.read_from
@@ -340,7 +348,9 @@ def _check_sizes(n_inputs: int, n_outputs: int, wiring: NDBCWiring, sub_steps: i
             raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
 
 
-def _check_options(dynamics: str, readout: str, max_rho: float | None, synapses: str) -> None:
+def _check_options(
+    dynamics: str, readout: str, max_rho: float | None, synapses: str, only_conductance: Mapping[str, Any]
+) -> None:
     for name, value, allowed in (
         ("dynamics", dynamics, DYNAMICS),
         ("readout", readout, ("all", "motor")),
@@ -350,8 +360,11 @@ def _check_options(dynamics: str, readout: str, max_rho: float | None, synapses:
             raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
     if max_rho is not None and dynamics != "dissipative":
         raise ValueError("max_rho belongs to dynamics='dissipative'; conductance dynamics are bounded as they are")
-    if synapses != "paper" and dynamics != "conductance":
-        raise ValueError(f"synapses={synapses!r} belongs to dynamics='conductance', got dynamics={dynamics!r}")
+    given = {name: value for name, value in only_conductance.items() if value is not None}
+    given |= {"synapses": synapses} if synapses != "paper" else {}
+    if given and dynamics != "conductance":
+        name, value = next(iter(given.items()))
+        raise ValueError(f"{name}={value!r} belongs to dynamics='conductance', got dynamics={dynamics!r}")
 
 
 def _check_intervals(interval: th.Tensor) -> None:

@@ -19,6 +19,7 @@ Price = Annotated[float, Range(0, 1e6)]
 LearningRate = Positive | Annotated[str, Prefixed("lin_", Range(0, above=True))]
 Temperature = NotNegative | Literal["auto"] | Annotated[str, Prefixed("auto_", Range(0, above=True))]
 UpdateRatio = Annotated[float, Range(0, 1000)]
+PositiveRange = Annotated[tuple[Positive, Positive], Increasing()]
 Neurons = Annotated[int, Range(1, 1024)]
 Fan = Annotated[int, Range(1, 4096)]
 Width = Annotated[int, Range(1, 16384)]
@@ -77,6 +78,18 @@ class PolicyConfig(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class TimeConstants(Settings):
+    """Initial time constants of each layer of the circuit, in control steps, drawn evenly on a logarithmic scale."""
+
+    inter: PositiveRange | None = None
+    """Of inter neurons; none: about 0.1 to 0.3, which forget within a control step."""
+    command: PositiveRange | None = None
+    """Of command neurons; none: about 0.1 to 0.3."""
+    motor: PositiveRange | None = None
+    """Of motor neurons; none: about 0.1 to 0.3."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class CircuitConfig(Settings):
     """NDBCNet, the low level's actor: who is wired to whom (table A1), and how potentials move (section 4.3)."""
 
@@ -105,6 +118,10 @@ class CircuitConfig(Settings):
     input current alone."""
     sensory_to: tuple[Literal["inter", "command", "motor"], ...] = ("inter",)
     """Layers that sensory neurons project to; a second and third one add reflexes, which skip layers."""
+    time_constants: TimeConstants | None = None
+    """Ranges of the initial time constants, for circuits that are to remember; none: all neurons are fast."""
+    initial_gains: PositiveRange | None = None
+    """Range of the initial gains of all logistics; none: 2 to 4."""
     input_scale: tuple[Positive, ...] | None = None
     """Fixed scales that inputs are divided by, one for each; none: those of the task."""
     readout: Literal["all", "motor"] = "all"
@@ -122,6 +139,9 @@ class CircuitConfig(Settings):
             )
         if self.synapses == "lean" and self.dynamics != "conductance":
             raise SettingError("synapses", f"'lean' needs dynamics='conductance', got dynamics={self.dynamics!r}")
+        for name in ("time_constants", "initial_gains"):
+            if getattr(self, name) is not None and self.dynamics != "conductance":
+                raise SettingError(name, f"needs dynamics='conductance', got dynamics={self.dynamics!r}")
         if self.max_rho is not None and self.dynamics != "dissipative":
             raise SettingError("max_rho", f"needs dynamics='dissipative', got dynamics={self.dynamics!r}")
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sb3_tbc.benchmark.cells import PAPER_TASKS, _straight_line, shipped_circuits
+from sb3_tbc.benchmark.cells import _straight_line
+from sb3_tbc.benchmark.circuits import PAPER_TASKS, shipped_circuits
 from sb3_tbc.benchmark.command import benchmark
 
 

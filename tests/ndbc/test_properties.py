@@ -28,6 +28,14 @@ FORMS = [
     for synapses in SYNAPSES
     for layers in (("inter",), ("inter", "command"), ("inter", "command", "motor"))
 ]
+FORMS += [
+    {
+        "synapses": synapses,
+        "time_constants": {"command": (0.3, 30.0), "motor": (2.0, 2.0)},
+        "initial_gains": (6.0, 12.0),
+    }
+    for synapses in SYNAPSES
+]
 FORM = st.sampled_from(FORMS)
 
 

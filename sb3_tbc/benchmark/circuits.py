@@ -1,0 +1,92 @@
+"""The circuits that the configurations ship, and what ``python -m sb3_tbc.benchmark parameters`` measures of them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from sb3_tbc.ndbc.diagnostics import count_parameters
+from sb3_tbc.ndbc.network import NDBCNet
+from sb3_tbc.ndbc.wiring import NDBCWiring
+
+PAPER_TASKS = ("AntFourRooms", "UR5Reacher", "Drawbridge", "Tennis2D", "Pendulum", "Platforms")
+WIRING_NUMBERS = (
+    "inter",
+    "command",
+    "motor",
+    "sensory_fanout",
+    "inter_fanout",
+    "recurrent_command_synapses",
+    "motor_fanin",
+)
+"""What the numbers of table A1 are, in order."""
+
+
+class ShippedCircuit(NamedTuple):
+    """The low level's circuit of a task, as a configuration ships it."""
+
+    task: str
+    config: str  # "paper" (table A1) or "tuned"
+    wiring: NDBCWiring
+    sub_steps: int
+    n_actions: int
+    hidden: list[int]  # widths of the MLP it replaces, the low level of HiTS
+
+    @property
+    def title(self) -> str:
+        """Task, and what is not table A1's."""
+        return self.task if self.config == "paper" else f"{self.task}, {self.config}, K = {self.sub_steps}"
+
+
+def shipped_circuits() -> list[ShippedCircuit]:
+    """Every task's circuit by table A1, followed by the tuned one where that is another."""
+    found: list[ShippedCircuit] = []
+    for task in PAPER_TASKS:
+        paper, tuned = (_shipped_circuit(task, config) for config in ("paper", "tuned"))
+        found.append(paper)
+        if (tuned.wiring, tuned.sub_steps) != (paper.wiring, paper.sub_steps):
+            found.append(tuned)
+    return found
+
+
+def paper_numbers(task: str) -> dict[str, int]:
+    """Table A1's numbers of a task's circuit."""
+    from sb3_tbc.zoo.config import load_config
+
+    numbers = load_config("tbc-hrl", task, "paper").model["low"]["policy_kwargs"]["ndbc"]
+    return {name: int(numbers[name]) for name in WIRING_NUMBERS}
+
+
+def _shipped_circuit(task: str, config: str) -> ShippedCircuit:
+    import gymnasium as gym
+
+    import sb3_tbc.tasks
+    from sb3_tbc.zoo.config import load_config
+
+    sb3_tbc.tasks.register_tasks()
+    settings = load_config("tbc-hrl", task, config)
+    env = gym.make(f"sb3_tbc/{task}-v0", **settings.env_kwargs)
+    subgoals = env.unwrapped.subgoals  # type: ignore[attr-defined]
+    numbers = settings.model["low"]["policy_kwargs"]["ndbc"]
+    wiring = NDBCWiring(subgoals.local_dim + subgoals.dim + 1, **{name: numbers[name] for name in WIRING_NUMBERS})
+    hidden = load_config("hits", task, config).model["low"]["policy_kwargs"]["net_arch"]
+    n_actions = env.action_space.shape[0]  # type: ignore[index]
+    env.close()
+    return ShippedCircuit(task, config, wiring, numbers.get("sub_steps", 3), n_actions, hidden)
+
+
+def parameters() -> tuple[list[str], dict[str, Any]]:
+    """The shipped circuits as SAC actors of the low level, beside the MLP of the task's configuration."""
+    lines = [
+        "| task | neurons | synapses | NDBC actor | MLP it replaces | MLP actor | share |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    rows = []
+    for circuit in shipped_circuits():
+        wiring = circuit.wiring
+        count = count_parameters(NDBCNet(wiring.n_inputs, 2 * circuit.n_actions, wiring, seed=0), circuit.hidden)
+        row = {"task": circuit.task, "config": circuit.config, "hidden": circuit.hidden}
+        rows.append({**row, **count._asdict(), "share": count.ratio})
+        widths = "x".join(str(h) for h in circuit.hidden)
+        numbers_of = (count.neurons, count.synapses, count.ndbc, widths, count.mlp)
+        lines.append(f"| {circuit.title} | {' | '.join(str(n) for n in numbers_of)} | {count.ratio:.1%} |")
+    return lines, {"parameters": rows}
