@@ -10,7 +10,7 @@ from sb3_tbc.errors import ConfigError
 
 MAX_NAME = 150
 """Longest name of a folder, in bytes; file systems allow 255, and files in it get suffixes."""
-SECRET = re.compile(r"(pass\w*|pwd|secret|token|key)\s*(=|%3d|:)", re.IGNORECASE)
+SECRET = re.compile(r"((?:pass\w*|pwd|secret|token|key)\s*(?:=|%3d|:))[^&]*", re.IGNORECASE)
 HIDDEN = "***"
 
 
@@ -62,6 +62,11 @@ def one_line(text: object, longest: int = 300) -> str:
     return line if len(line) <= longest else f"{line[: longest - 3]}..."
 
 
+def in_docstring(text: str) -> str:
+    """A text within the docstring of a module that is written: nothing in it ends the string or escapes from it."""
+    return one_line(text).replace("\\", "\\\\").replace('"', '\\"').encode("ascii", "backslashreplace").decode()
+
+
 def without_password(url: str) -> str:
     """A storage's name without its password, wherever one stands, in a mistyped URL too.
 
@@ -76,11 +81,11 @@ def without_password(url: str) -> str:
         head = f"{user}{colon}{HIDDEN if colon else ''}{at}{host}"
     elif scheme and not _looks_like_host(head):
         head = f"{head.partition(':')[0]}:{HIDDEN}"
-    elif SECRET.search(head):
-        head = _up_to_secret(head)
+    else:
+        head = _hide_secrets(head)
     if "@" in tail and not at:  # the account stands behind the mark: a password with ? or # in it
         return f"{scheme}{head.partition(':')[0]}:{HIDDEN}@{tail.rpartition('@')[2]}"
-    return f"{scheme}{head}{mark}{_up_to_secret(tail) if SECRET.search(tail) else tail}"
+    return f"{scheme}{head}{mark}{_hide_secrets(tail)}"
 
 
 def _split_scheme(head: str) -> tuple[str, str]:
@@ -104,6 +109,6 @@ def _looks_like_host(head: str) -> bool:
     )
 
 
-def _up_to_secret(text: str) -> str:
-    found = SECRET.search(text)
-    return text if found is None else f"{text[: found.end()]}{HIDDEN}"
+def _hide_secrets(text: str) -> str:
+    """Hide what follows a name that speaks of a secret, up to the next part of a query."""
+    return SECRET.sub(rf"\g<1>{HIDDEN}", text)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sb3_tbc.export.policy import Circuit, ExportedPolicy
+from sb3_tbc.outside import in_docstring
 
 
 def to_numpy_module(policy: ExportedPolicy) -> str:
@@ -37,7 +38,7 @@ def to_numpy_module(policy: ExportedPolicy) -> str:
     runtime = template[template.index("# --- runtime ---") :]
     names = "\n".join(f"    {name!r}: {value!r}," for name, value in settings.items())
     return (
-        f'"""Two-level policy for {policy.task}, exported from sb3_tbc. Needs NumPy alone.\n\n'
+        f'"""Two-level policy for {in_docstring(policy.task)}, exported from sb3_tbc. Needs NumPy alone.\n\n'
         "    state = initial_state()\n"
         "    action, state = step(observation, achieved_goal, desired_goal, state)\n"
         '"""\n\nfrom __future__ import annotations\n\nimport base64\nimport io\nfrom typing import Any\n\n'

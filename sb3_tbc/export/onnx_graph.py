@@ -10,6 +10,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy, FloatArray
+from sb3_tbc.outside import one_line
 
 OPSET = 17
 STATE_NAMES = ("subgoal", "time_budget", "elapsed", "membrane")
@@ -227,7 +228,7 @@ def _model(g: _Graph, policy: ExportedPolicy) -> onnx.ModelProto:
             kind = TensorProto.FLOAT if name == "membrane" else TensorProto.DOUBLE
             inputs.append(tensor(name, width, kind))
             outputs.append(tensor(f"next_{name}", width, kind))
-    graph = helper.make_graph(g.nodes, policy.task, inputs, outputs, list(g.constants.values()))
+    graph = helper.make_graph(g.nodes, one_line(policy.task), inputs, outputs, list(g.constants.values()))
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="sb3_tbc")
     model.ir_version = 8
     onnx.checker.check_model(model)

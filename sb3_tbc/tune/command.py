@@ -17,6 +17,7 @@ import torch as th
 from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
+from sb3_tbc.outside import flat_name, folder_name
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tune.objectives import ACROSS, OBJECTIVES
 from sb3_tbc.tune.search_space import complete, load_space, restrict
@@ -191,7 +192,7 @@ def open_command_study(args: argparse.Namespace) -> tuple[Study, StudySettings, 
     algorithm(args.algo)
     task, _ = resolve_env(args.env)
     studies.make_sampler(args.sampler, args.sampler_seed)
-    name = args.study_name or f"{args.algo}-{task}".replace("/", "_").replace(":", "_")
+    name = folder_name(args.study_name or flat_name(f"{args.algo}-{task}", "the study's name"), "--study-name")
     folder = args.log_folder / name
     storage = args.storage or str(folder / "journal.log")
     given = {"algo": args.algo, "env": task, **asked(args)}
@@ -200,11 +201,16 @@ def open_command_study(args: argparse.Namespace) -> tuple[Study, StudySettings, 
     if args.trial is not None and not studies.is_url(storage) and not Path(storage).is_file():
         raise ConfigError(f"no study {name!r}: there is no {storage}; search first, or name its --storage")
     opened = studies.open_storage(storage, args.grace_seconds)
-    if wanted is None and args.trial is None and name not in studies.names(opened):
+    with studies.readable(storage):
+        known = studies.names(opened)
+    if wanted is None and args.trial is None and name not in known:
         wanted = new_settings(args)
-    study, settings = studies.open_study(
-        opened, name, studies.shown(storage), wanted, given if args.trial is None else {}
-    )
+    if args.trial is None:
+        studies.claim_folder(folder, storage, name not in known)
+    with studies.readable(storage):
+        study, settings = studies.open_study(
+            opened, name, studies.shown(storage), wanted, given if args.trial is None else {}
+        )
     return study, settings, storage, folder
 
 
@@ -227,9 +233,10 @@ def command(argv: Sequence[str]) -> int:
 
 def search(args: argparse.Namespace, study: Study, settings: StudySettings, storage: str, folder: Path) -> int:
     """Run the workers and write what was found."""
-    from sb3_tbc.tune.study import count_done, shown
+    from sb3_tbc.tune.study import count_done, shown, try_sampler
     from sb3_tbc.tune.worker import Job, run_workers
 
+    try_sampler(args.sampler, settings)
     stop_like_ctrl_c()
     runs = f"{settings.n_seeds} seeds of {settings.run.n_timesteps:,} steps each"
     print(f"study          {study.study_name}: {settings.algo} on {settings.task}, {settings.objective}, {runs}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import re
+import os
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -16,13 +16,16 @@ import numpy as np
 import optuna
 from optuna.storages import BaseStorage, RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.storages._heartbeat import BaseHeartbeat
-from optuna.storages.journal import JournalFileBackend, JournalStorage
+from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock, JournalStorage
+from optuna.storages.journal._file import get_lock_file
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.files import explained, write_atomic
+from sb3_tbc.outside import HIDDEN, one_line, without_password
 from sb3_tbc.tune.objectives import OBJECTIVES
-from sb3_tbc.tune.search_space import Space, Values, apply, build_space, project
+from sb3_tbc.tune.search_space import Space, Values, apply, build_space, project, suggest
 from sb3_tbc.zoo.config import RunConfig
 
 SETTINGS = "settings"
@@ -36,6 +39,7 @@ WORKER = "worker"
 COUNTED = (TrialState.COMPLETE, TrialState.PRUNED)
 """States of trials that are done; a failed trial is not, because it is run again."""
 MAX_RETRIES = 3
+shown = without_password
 JOURNAL_SUFFIXES = (".log", ".journal")
 Retry = Callable[[Study, FrozenTrial], None]
 
@@ -180,14 +184,6 @@ def is_url(storage: str) -> bool:
     return "://" in storage
 
 
-def shown(storage: str) -> str:
-    """A storage's name without its password, wherever it stands, in a mistyped URL too."""
-    begin, slashes, rest = storage.partition("//")
-    account, at, host = rest.rpartition("@")
-    host = re.sub(r"(password=)[^&]*", r"\1***", host)
-    return f"{begin}{slashes}{account.partition(':')[0]}{':***' if ':' in account else ''}{at}{host}"
-
-
 def open_storage(storage: str, grace: int = 120) -> BaseStorage:
     """Open a journal file (created with its folder) or a database, with a heartbeat either way.
 
@@ -221,14 +217,77 @@ def _open(storage: str, grace: int) -> BaseStorage:
             f"storage must be a journal file ending in {' or '.join(JOURNAL_SUFFIXES)}, or a URL like "
             f"sqlite:///study.db or postgresql+psycopg://user@host/name; got {shown(storage)!r}"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
+    with explained(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        drop_half_line(path)
     return JournalWithHeartbeat(path, interval, grace, retry)
 
 
 def _first_line(error: Exception, storage: str) -> str:
-    """A driver's message in short; it may quote the whole URL."""
+    """A driver's message in short; it may quote the whole URL, or the password alone."""
     text = str(error).replace(storage, shown(storage)).strip() or type(error).__name__
-    return text.splitlines()[0][:300]
+    before, hidden, after = shown(storage).partition(HIDDEN)
+    secret = storage[len(before) : len(storage) - len(after)] if hidden else ""
+    text = text.replace(secret, HIDDEN) if len(secret) > 2 else text
+    return one_line(text.splitlines()[0])
+
+
+def drop_half_line(path: Path) -> None:
+    """Cut off a last line of a journal that a killed process, or a full disk, left without its end.
+
+    Optuna passes over such a line, but the next one would be written behind it, and together they cannot be read.
+    """
+    if not path.is_file():
+        return
+    lock = JournalFileSymlinkLock(str(path))
+    with get_lock_file(lock), path.open("rb+") as file:
+        size = file.seek(0, os.SEEK_END)
+        file.seek(max(size - LONGEST_LINE, 0))
+        tail = file.read()
+        if tail and not tail.endswith(b"\n"):
+            file.truncate(size - len(tail) + tail.rfind(b"\n") + 1)
+            file.flush()
+            os.fsync(file.fileno())
+
+
+LONGEST_LINE = 2**24
+"""Longest line of a journal that is looked for, bytes; Optuna writes some 100,000 for the settings of a study."""
+
+
+@contextlib.contextmanager
+def readable(storage: str) -> Iterator[None]:
+    """Say in one line what is wrong with a storage that cannot be read within.
+
+    :param storage: its name
+    :raises ConfigError: then, without the password
+    """
+    try:
+        yield
+    except (ConfigError, OSError):
+        raise
+    except Exception as error:  # a damaged page or line raises whatever the reader happens to meet
+        text = _first_line(error, storage)
+        raise ConfigError(f"cannot read storage {shown(storage)}, it may be damaged: {text}") from error
+
+
+def claim_folder(folder: Path, storage: str, fresh: bool) -> None:
+    """Keep the runs of two studies of one name apart: a folder belongs to the storage that it was begun with.
+
+    :param folder: of the study's runs
+    :param storage: name of the storage
+    :param fresh: whether the study has just begun
+    :raises ConfigError: if the folder holds the runs of another study
+    """
+    marker, own = folder / "storage.txt", shown(storage) if is_url(storage) else str(Path(storage).resolve())
+    known = marker.read_text(encoding="utf-8", errors="replace").strip() if marker.is_file() else None
+    taken = known != own if known is not None else fresh and any(folder.glob("trial_*"))
+    if taken:
+        raise ConfigError(
+            f"{folder} holds the runs of another study (storage {known or 'unknown'}); use another --study-name or "
+            "--log-folder"
+        )
+    if known is None:
+        write_atomic(marker, own + "\n")
 
 
 def names(storage: BaseStorage) -> set[str]:
@@ -349,3 +408,25 @@ def make_sampler(name: str, seed: int | None, stream: tuple[int, ...] = ()) -> o
     except (TypeError, ImportError) as error:
         raise ConfigError(f"sampler {name!r} cannot be used by name: {error}; use tpe or random") from error
     return sampler
+
+
+def try_sampler(name: str, settings: StudySettings) -> None:
+    """Draw a few trials, so that a sampler that cannot search this space is told of before the first run.
+
+    :raises ConfigError: if it fails
+    """
+    try:
+        study = optuna.create_study(sampler=make_sampler(name, 0), direction=settings.direction)
+        for k in range(TRIED):
+            trial = study.ask()
+            suggest(settings.parameters, trial, None)
+            study.tell(trial, float(k % 3))
+    except ConfigError:
+        raise
+    except Exception as error:
+        text = one_line(error)
+        raise ConfigError(f"sampler {name!r} cannot search this space: {text}; use tpe or random") from error
+
+
+TRIED = 12
+"""Trials to try a sampler on: most draw their first ten at random."""

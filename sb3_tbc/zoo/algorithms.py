@@ -148,6 +148,8 @@ def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu", trust
         return ALGORITHMS[name].load(path, env=env, device=device, trust=trust)
     except ConfigError:
         raise
+    except (ValueError, RuntimeError) as error:
+        raise ConfigError(f"cannot load {path} as {name}: {one_line(error, 1000)}") from error
     except Exception as error:  # a stranger's file can be wrong in any way
         raise ConfigError(f"cannot load {path} as {name}: {type(error).__name__}: {one_line(error)}") from error
 
