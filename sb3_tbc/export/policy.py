@@ -173,6 +173,8 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     if subgoals.rotations and rules.window_end == "reached":
         raise ConfigError("window_end='reached' with subgoals that are compared by angle cannot be exported")
     high, low = model.high.policy.average_actor, model.low.policy.average_actor
+    if model.foreign_high is not None:
+        high = _foreign_actor(model.foreign_high)
     if isinstance(high, NDBCActor):
         raise ConfigError("only the low level can be a circuit")
     actions: Any = model.action_space
@@ -214,17 +216,34 @@ def _actions(actor: MLPActor | NDBCActor) -> int:
     return int(np.prod(actor.action_space.shape))
 
 
-def _bound(actor: MLPActor | NDBCActor) -> float:
-    return np.inf if actor.head.mean_bound is None else float(actor.head.mean_bound)
+def _bound(actor: Any) -> float:
+    head = getattr(actor, "head", None)  # stock SAC bounds its means by tanh alone
+    return np.inf if head is None or head.mean_bound is None else float(head.mean_bound)
 
 
-def _read_mlp(actor: MLPActor) -> MLP:
+def _foreign_actor(algorithm: Any) -> Any:
+    """The actor of another algorithm in the place of the high level, if it is an MLP whose means tanh squashes.
+
+    :raises ConfigError: if it is of another kind
+    """
+    from sb3_contrib.tqc.policies import Actor as TQCActor
+    from stable_baselines3.sac.policies import Actor as SACActor
+
+    actor = getattr(algorithm.policy, "actor", None)
+    if isinstance(actor, SACActor | TQCActor) and not actor.use_sde:
+        return actor
+    raise ConfigError(
+        f"the policy of {type(algorithm).__name__} cannot be exported as a high level; SAC's and TQC's can"
+    )
+
+
+def _read_mlp(actor: Any) -> MLP:
     if actor.activation_fn not in ACTIVATIONS:
         allowed = ", ".join(ACTIVATIONS.values())
         raise ConfigError(f"only networks with {allowed} can be exported, this one has {actor.activation_fn.__name__}")
     layers = [m for m in actor.latent_pi.modules() if isinstance(m, nn.Linear)] + [actor.mu]
-    weights = tuple(_numpy(layer.weight).T.copy() for layer in layers)  # type: ignore[arg-type]
-    return MLP(weights, tuple(_numpy(layer.bias) for layer in layers), ACTIVATIONS[actor.activation_fn])  # type: ignore[arg-type]
+    weights = tuple(_numpy(layer.weight).T.copy() for layer in layers)
+    return MLP(weights, tuple(_numpy(layer.bias) for layer in layers), ACTIVATIONS[actor.activation_fn])
 
 
 @th.no_grad()

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
@@ -32,6 +33,7 @@ from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, goal_test_of
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of
 from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, mismatch_explained, reward_range
+from sb3_tbc.tbc_hrl.foreign_high import put_together
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY
@@ -63,6 +65,8 @@ class TBCHRL(PlainAlgorithm):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": TBCPolicy}
     policy: TBCPolicy
+    foreign_high: BaseAlgorithm | None = None
+    """The algorithm that proposes options in the place of the high level, see :meth:`from_levels`."""
     config_class: ClassVar[type[TBCConfig]] = TBCConfig
     __signature__ = SignatureOfSettings(HierarchyArguments)
 
@@ -194,6 +198,7 @@ class TBCHRL(PlainAlgorithm):
         progress_bar: bool = False,
     ) -> SelfTBCHRL:
         """Collect whole episodes, then update both levels in a burst, until ``total_timesteps`` steps are done."""
+        self._refuse_foreign_high("learn")
         resumed, self._resumed = {} if reset_num_timesteps else self._resumed, {}
         planned = total_timesteps + (self.num_timesteps if resumed else 0)
         total_timesteps, callback = self._setup_learn(
@@ -306,6 +311,34 @@ class TBCHRL(PlainAlgorithm):
         """
         with mismatch_explained():
             return super().load(*args, **kwargs)
+
+    @classmethod
+    def from_levels(cls, high: BaseAlgorithm, low: TBCHRL) -> TBCHRL:
+        """An agent whose high level is another algorithm's policy, for ``predict``, evaluation and export.
+
+        It shares the low level with ``low`` and is neither trained nor saved: save the two parts instead, and put them
+        together again.
+
+        :param high: trained in an :class:`~sb3_tbc.tbc_hrl.option_env.OptionEnv` with ``low``
+        :param low: the agent that executes the options
+        :raises ValueError: if the two do not fit
+        """
+        return put_together(high, low)
+
+    def save(self, *args: Any, **kwargs: Any) -> None:
+        """Save the agent, see SB3.
+
+        :raises ValueError: for an agent from :meth:`from_levels`
+        """
+        self._refuse_foreign_high("save")
+        super().save(*args, **kwargs)
+
+    def _refuse_foreign_high(self, what: str) -> None:
+        if self.foreign_high is not None:
+            raise ValueError(
+                f"an agent from from_levels cannot {what}: its high level is a {type(self.foreign_high).__name__}. "
+                f"Use high.{what}(...) and low.{what}(...), then from_levels again"
+            )
 
     def learning_state(self) -> dict[str, np.ndarray[Any, Any]]:
         """What learning goes on from besides weights and replay, as plain arrays: random streams, open options."""

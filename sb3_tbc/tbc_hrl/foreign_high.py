@@ -1,0 +1,58 @@
+"""Another algorithm's policy in the place of an agent's high level."""
+
+from __future__ import annotations
+
+import copy
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.tbc_hrl.actor import TwoLevelActor
+
+if TYPE_CHECKING:
+    from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
+
+
+class ForeignHigh:
+    """Proposes options as an algorithm's policy does; it is not trained any more.
+
+    :param algorithm: trained in an :class:`~sb3_tbc.tbc_hrl.option_env.OptionEnv`
+    """
+
+    def __init__(self, algorithm: BaseAlgorithm) -> None:
+        self.algorithm = algorithm
+
+    def act(
+        self, observations: FloatArray, states: FloatArray, deterministic: bool, rng: Any, average: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Unit subgoals and time budgets ``(n, action_dim)``, and the empty states.
+
+        :param observations: the high level's, ``(n, high_dim)``
+        :param rng: not used; the algorithm draws from its own random numbers
+        :param average: not used
+        """
+        unit, _ = self.algorithm.predict(observations, deterministic=deterministic)
+        return np.clip(unit, -1.0, 1.0).astype(np.float32), states
+
+
+def put_together(high: BaseAlgorithm, low: TBCHRL) -> TBCHRL:
+    """A copy of an agent whose options another algorithm proposes.
+
+    :raises ValueError: if the algorithm's observations or actions are not those of the agent's high level
+    """
+    views, space = low.policy.views, low.observation_space
+    wanted: tuple[Any, Any] = views.high_space(space), views.high_action_space()  # type: ignore[arg-type]
+    given = high.observation_space, high.action_space
+    if given[0].shape != wanted[0].shape or given[1].shape != wanted[1].shape:
+        raise ValueError(
+            f"high must observe {wanted[0].shape} and act {wanted[1].shape}, got {given[0].shape} and "
+            f"{given[1].shape}: train it in OptionEnv(venv, agent) with this agent"
+        )
+    agent = copy.copy(low)
+    agent.policy = copy.copy(low.policy)
+    actor: Any = TwoLevelActor(ForeignHigh(high), low.low, low.policy.memory)  # type: ignore[arg-type]
+    agent.policy.actor = actor
+    agent.foreign_high = high
+    return agent

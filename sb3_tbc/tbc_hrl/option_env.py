@@ -1,0 +1,151 @@
+"""The semi-Markov problem that a fixed low level makes of a task: any algorithm can be the high level in it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.episode_limit import ANNOUNCE, LastWindow, with_episode_limit
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
+from sb3_tbc.smdp.options import OptionClock
+from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
+
+Indices = NDArray[np.intp]
+
+
+class OptionEnv(VecEnvWrapper):
+    """One step is one option: the action is a subgoal with its time budget, which a trained low level executes.
+
+    Observations are what the high level of an agent sees, one flat vector; actions are in [-1, 1]. A step's reward is
+    the high level's (paper section 4.1, without completion bonus), ``info["discount"]`` the factor of the next state's
+    value, for algorithms that use it, and ``info["option"]`` says what happened. Episodes end as the agent's do.
+
+    Options last differently long, so that each environment is stepped by itself until its option is over::
+
+        venv = OptionEnv(make_vec_env("sb3_tbc/Pendulum-v0", 4), agent)
+        high = PPO("MlpPolicy", venv).learn(50_000)
+        agent = TBCHRL.from_levels(high, agent)
+
+    :param venv: a ``DummyVecEnv`` or ``SubprocVecEnv`` of the agent's task; wrappers of vectors (``VecMonitor``) go
+        around the ``OptionEnv``
+    :param agent: gives the low level, and what ends an option; it is used as it is, not trained
+    :param deterministic: whether the low level acts by its means
+    :param seed: of the low level's noise where it does not
+    :raises ValueError: if ``venv`` is wrapped, or is no vector of goal environments
+    """
+
+    def __init__(self, venv: VecEnv, agent: TBCHRL, deterministic: bool = True, seed: int | None = None) -> None:
+        if isinstance(venv, VecEnvWrapper):
+            raise ValueError(
+                f"OptionEnv steps each environment by itself, past {type(venv).__name__}: give it the DummyVecEnv or "
+                "SubprocVecEnv itself, and put wrappers around the OptionEnv"
+            )
+        space = check_goal_space(venv.observation_space, venv.action_space)
+        policy = agent.policy
+        super().__init__(
+            with_episode_limit(venv),
+            observation_space=policy.views.high_space(space),
+            action_space=policy.views.high_action_space(),
+        )
+        self.agent, self.policy, self.deterministic = agent, policy, deterministic
+        self.rng = np.random.default_rng(seed)
+        self.clock = OptionClock(venv.num_envs, policy.views.subgoals, policy.rules)
+        self._membrane = policy.actor.blank(venv.num_envs)
+        self._seen: dict[str, FloatArray] = {}
+        self._actions: FloatArray = np.zeros((venv.num_envs, 0))
+
+    def reset(self) -> FloatArray:
+        """Begin an episode everywhere."""
+        observation: Any = self.venv.reset()
+        self.reset_infos = list(self.venv.reset_infos)
+        self._seen = {key: np.array(observation[key]) for key in GOAL_KEYS}
+        self._forget(np.arange(self.num_envs))
+        return self.policy.views.high(self._seen)
+
+    def step_async(self, actions: NDArray[Any]) -> None:
+        """Take the next options, in unit coordinates; what lies outside [-1, 1] is clipped."""
+        self._actions = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Run every environment to the end of its option."""
+        self._begin()
+        rewards: list[list[float]] = [[] for _ in range(self.num_envs)]
+        dones = np.zeros(self.num_envs, dtype=bool)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        live = np.arange(self.num_envs)
+        while len(live):
+            for index, action in zip(live, self._act(live), strict=True):
+                reward, dones[index], infos[index] = self._step_one(int(index), action)
+                rewards[index].append(reward)
+            self.clock.elapsed[live] += 1
+            over = self.clock.ended(self._seen) | dones
+            self._membrane = self.policy.actor.forget(self._membrane, over, dones)
+            live = live[~over[live]]
+        values = np.array([self._close(i, rewards[i], bool(dones[i]), infos[i]) for i in range(self.num_envs)])
+        ended = np.array(["terminal_observation" in info for info in infos])
+        return self.policy.views.high(self._seen), values.astype(np.float32), ended, infos
+
+    # ------------------------------------------------------------------ inner workings
+
+    def _forget(self, where: Indices) -> None:
+        self.clock.begin_episode(where)
+        self._membrane[where] = 0.0
+
+    def _begin(self) -> None:
+        """Start the options that were asked for, and tell the environments which are the last of their episodes."""
+        schedule, everywhere = self.policy.schedule, np.arange(self.num_envs)
+        unit = self._actions if schedule is None else schedule(self._actions, self._seen)
+        self.clock.begin(everywhere, unit)
+        rules = self.policy.rules
+        for index in np.flatnonzero(self.clock.used >= rules.max_options):
+            steps = max(1, math.ceil(self.clock.time_budget[index]))
+            subgoal = self.clock.subgoal[index].copy() if rules.ends_when_reached else None
+            window = LastWindow(steps, self.policy.views.subgoals, subgoal, math.ceil(rules.dt_min))
+            self.venv.env_method(ANNOUNCE, window, indices=[int(index)])
+
+    def _act(self, live: Indices) -> NDArray[Any]:
+        """The low level's actions in the environments whose option is running."""
+        policy, seen = self.policy, {key: self._seen[key][live] for key in GOAL_KEYS}
+        remaining = policy.rules.remaining(self.clock.time_left[live])
+        observation = policy.views.low(seen, self.clock.subgoal[live], remaining)
+        unit, after = policy.actor.act(observation, self._membrane[live], self.deterministic, self.rng)
+        self._membrane[live] = after
+        actions: NDArray[Any] = policy.unit.unscale(unit)
+        return actions
+
+    def _step_one(self, index: int, action: NDArray[Any]) -> tuple[float, bool, dict[str, Any]]:
+        """One step of one environment: its reward, whether its episode is over, its info."""
+        observation, reward, terminated, truncated, info = self.venv.env_method("step", action, indices=[index])[0]
+        for key in GOAL_KEYS:
+            self._seen[key][index] = observation[key]
+        over = bool(terminated or truncated)
+        return float(reward), over, {**info, "TimeLimit.truncated": over and not terminated}
+
+    def _close(self, index: int, rewards: list[float], over: bool, info: dict[str, Any]) -> float:
+        """Reward of the option that ended; begins a new episode where that is over, too."""
+        reward, duration = self.agent.high_reward, np.array([len(rewards)])
+        reached = bool(self.clock.reached({key: self._seen[key][[index]] for key in GOAL_KEYS}, np.array([index]))[0])
+        info["option"] = self.clock.close(index, int(duration[0]), reached, over).as_info()
+        info["discount"] = float(reward.discounts(duration)[0])
+        value = reward.of(np.array(rewards), np.array([0]), duration)[0]
+        if self.policy.views.timed_actions:
+            value -= reward.duration_cost * self.clock.time_budget[index] / self.policy.rules.dt_max
+        used_up = self.clock.used[index] >= self.policy.rules.max_options
+        if over or used_up:
+            info["TimeLimit.truncated"] = bool(info["TimeLimit.truncated"] or not over)
+            self._restart(index, info)
+        return float(value)
+
+    def _restart(self, index: int, info: dict[str, Any]) -> None:
+        last = {key: self._seen[key][[index]] for key in GOAL_KEYS}
+        info["terminal_observation"] = self.policy.views.high(last)[0]
+        observation, self.reset_infos[index] = self.venv.env_method("reset", indices=[index])[0]
+        for key in GOAL_KEYS:
+            self._seen[key][index] = observation[key]
+        self._forget(np.array([index]))

@@ -1,0 +1,132 @@
+"""Any algorithm as the high level: the task as its options see it, vectorised as SB3 wants it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from corridor import Corridor
+from sb3_contrib import TQC, CrossQ
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+
+from sb3_tbc import TBCHRL
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.export.policy import extract
+from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
+from sb3_tbc.tbc_hrl.option_env import OptionEnv
+
+SMALL = {"policy_kwargs": {"net_arch": [16, 16]}, "seed": 0}
+
+
+@pytest.fixture(scope="module")
+def agent() -> TBCHRL:
+    return TBCHRL("MultiInputPolicy", Corridor(), max_options=5, compile=False, seed=0).learn(300)
+
+
+def options(agent: TBCHRL, n: int = 2, **kwargs: Any) -> OptionEnv:
+    return OptionEnv(make_vec_env(Corridor, n, seed=3), agent, **kwargs)
+
+
+def test_a_step_is_an_option(agent: TBCHRL) -> None:
+    env = options(agent)
+    first = env.reset()
+    assert first.shape == (2, *env.observation_space.shape)  # type: ignore[misc]
+    actions = np.array([[0.0, -0.5], [0.0, 1.0]])
+    observation, rewards, dones, infos = env.step(actions)
+    assert rewards.dtype == np.float32
+    assert dones.dtype == bool
+    budgets = agent.rules.budget(actions[:, 1])
+    for index in range(2):
+        option = infos[index]["option"]
+        assert option["duration"] == np.ceil(budgets[index])
+        expected = agent.high_reward.of(-np.ones(option["duration"]), np.array([0]), np.array([option["duration"]]))[0]
+        expected -= agent.high_reward.duration_cost * budgets[index] / agent.rules.dt_max
+        if not dones[index]:
+            assert rewards[index] == pytest.approx(expected, rel=1e-6)
+            assert observation[index, 2] == option["duration"]  # the corridor shows its steps
+        assert infos[index]["discount"] == pytest.approx(agent.high_reward.gamma_step ** option["duration"])
+
+
+def test_episodes_end_as_the_agents_do_and_monitors_see_it(agent: TBCHRL) -> None:
+    """Far-off goals: each episode uses up its five options, and every monitor counts all of its steps."""
+    vec = make_vec_env(lambda: Corridor(goal=0.99), 2)
+    env = VecMonitor(OptionEnv(vec, agent))
+    env.reset()
+    lengths = np.zeros(2, dtype=int)
+    for step in range(1, 16):
+        before = lengths.copy()
+        observation, _, dones, infos = env.step(np.array([[-1.0, -0.6], [-1.0, 0.2]]))
+        lengths += [info["option"]["duration"] for info in infos]
+        assert (dones == (step % 5 == 0)).all()
+        for index in np.flatnonzero(dones):
+            info = infos[index]
+            assert info["TimeLimit.truncated"]
+            assert info["terminal_observation"][2] == lengths[index]
+            assert info["episode"]["l"] == 5  # options, as the outer monitor counts
+            assert observation[index, 2] == 0.0
+        lengths[dones] = 0
+        assert (before < 51).all()
+    episodes = vec.env_method("get_episode_lengths")
+    assert [len(each) for each in episodes] == [3, 3]
+
+
+def test_success_terminates(agent: TBCHRL) -> None:
+    env = OptionEnv(DummyVecEnv([lambda: Corridor(goal=0.0)]), agent)
+    env.reset()
+    _, _, dones, infos = env.step(np.array([[0.0, 1.0]]))
+    assert dones[0]
+    assert not infos[0]["TimeLimit.truncated"]
+    assert infos[0]["is_success"]
+    assert infos[0]["option"]["reason"] == "episode_end"
+
+
+def test_processes_give_what_one_process_gives(agent: TBCHRL) -> None:
+    traces = []
+    for kind in (DummyVecEnv, SubprocVecEnv):
+        env = OptionEnv(make_vec_env(Corridor, 2, seed=5, vec_env_cls=kind), agent)
+        rng = np.random.default_rng(0)
+        trace = [env.reset()]
+        trace += [part for _ in range(8) for part in env.step(rng.uniform(-1, 1, (2, 2)))[:3]]
+        traces.append(np.concatenate([np.ravel(part) for part in trace]))
+        env.close()
+    np.testing.assert_array_equal(*traces)
+
+
+def test_wrapped_vectors_are_refused(agent: TBCHRL) -> None:
+    with pytest.raises(ValueError, match="past VecMonitor"):
+        OptionEnv(VecMonitor(make_vec_env(Corridor, 1)), agent)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, SAC, TQC, CrossQ])
+def test_any_algorithm_is_the_high_level(agent: TBCHRL, algorithm: Any) -> None:
+    short = {"n_steps": 16, "batch_size": 16} if algorithm is PPO else {"learning_starts": 8, "batch_size": 8}
+    high = algorithm("MlpPolicy", options(agent), **SMALL, **short).learn(40)
+    together = TBCHRL.from_levels(high, agent)
+    result = evaluate_agent(together, DummyVecEnv([Corridor]), 3, seed=0)
+    assert len(result.successes) == 3
+    observation, _ = Corridor().reset(seed=0)
+    views = agent.policy.views
+    batch = {key: np.asarray(part)[None] for key, part in observation.items()}
+    _, state = together.predict(observation, deterministic=True)
+    wanted, _ = high.predict(views.high(batch), deterministic=True)
+    assert state is not None
+    np.testing.assert_allclose(state[0][0], views.subgoals.unscale(wanted[0, :-1].astype(np.float32)), rtol=1e-4)
+    for what in (lambda: together.learn(10), lambda: together.save("/tmp/never.zip")):
+        with pytest.raises(ValueError, match="from_levels cannot"):
+            what()
+    assert agent.foreign_high is None
+    if algorithm in (SAC, TQC):
+        policy = extract(together, "corridor")
+        assert policy.mean_bounds[0] == np.inf
+        assert policy.high.weights[0].shape == (4, 16)
+    else:
+        with pytest.raises(ConfigError, match="cannot be exported as a high level"):
+            extract(together, "corridor")
+
+
+def test_levels_that_do_not_fit_are_refused(agent: TBCHRL) -> None:
+    with pytest.raises(ValueError, match="train it in OptionEnv"):
+        TBCHRL.from_levels(SAC("MlpPolicy", "Pendulum-v1", **SMALL), agent)
