@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import copy
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
-
-if TYPE_CHECKING:
-    from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 
 
 class ForeignHigh:
@@ -37,13 +34,14 @@ class ForeignHigh:
         return np.clip(unit, -1.0, 1.0).astype(np.float32), states
 
 
-def put_together(high: BaseAlgorithm, low: TBCHRL) -> TBCHRL:
+def put_together(high: BaseAlgorithm, low: Any) -> Any:
     """A copy of an agent whose options another algorithm proposes.
 
+    :param low: a :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`
     :raises ValueError: if the algorithm's observations or actions are not those of the agent's high level
     """
     views, space = low.policy.views, low.observation_space
-    wanted: tuple[Any, Any] = views.high_space(space), views.high_action_space()  # type: ignore[arg-type]
+    wanted: tuple[Any, Any] = views.high_space(space), views.high_action_space()
     given = high.observation_space, high.action_space
     if given[0].shape != wanted[0].shape or given[1].shape != wanted[1].shape:
         raise ValueError(

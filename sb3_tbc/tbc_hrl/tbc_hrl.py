@@ -323,7 +323,8 @@ class TBCHRL(PlainAlgorithm):
         :param low: the agent that executes the options
         :raises ValueError: if the two do not fit
         """
-        return put_together(high, low)
+        agent: TBCHRL = put_together(high, low)
+        return agent
 
     def save(self, *args: Any, **kwargs: Any) -> None:
         """Save the agent, see SB3.
