@@ -83,6 +83,7 @@ bench: install
 
 pretrained: install
 	$(BIN)/python scripts/pretrained.py $(TASKS)
+	$(BIN)/python scripts/interpretation.py
 
 clean:
 	rm -rf build dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis
