@@ -12,6 +12,7 @@ from typing import Any
 
 import sb3_tbc
 from sb3_tbc.commands import COMMANDS
+from sb3_tbc.zoo.settings_page import settings_markdown
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "images"))
@@ -68,4 +69,5 @@ def setup(app: Any) -> None:
     """Sphinx's hook: derive pages before they are read."""
     os.environ["COLUMNS"] = "100"
     write_commands()
+    _write("settings.md", settings_markdown())
     write_curves()
