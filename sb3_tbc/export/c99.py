@@ -33,7 +33,7 @@ def to_c(policy: ExportedPolicy) -> str:
         "FORGET": {"window": "over", "episode": "started", "none": "1"}[policy.memory],
         "ASKED": "(state->subgoal[i] - here[i])" if policy.relative_subgoals else "state->subgoal[i]",
         "UNITS": str(policy.subgoal_dim + (policy.fixed_budget is None)),
-        "BUDGET": _CHOSEN if policy.fixed_budget is None else repr(policy.fixed_budget),
+        "BUDGET": _budget(policy),
         "REMAINING": _REMAINING if policy.remaining_time else "",
         "LOCAL": str(len(policy.local)),
     }
@@ -41,6 +41,12 @@ def to_c(policy: ExportedPolicy) -> str:
     for name, value in values.items():
         text = text.replace(f"@{name}@", value)
     return text
+
+
+def _budget(policy: ExportedPolicy) -> str:
+    if policy.fixed_budget is not None:
+        return repr(policy.fixed_budget)
+    return f"fmax(rint({_CHOSEN}), 1.0)" if policy.whole_budgets else _CHOSEN
 
 
 def _template(name: str) -> str:

@@ -75,7 +75,8 @@ def _begin(observation: Array, achieved_goal: Array, desired_goal: Array, state:
     state["subgoal"] = low + 0.5 * (unit[: len(low)] + 1.0) * (high - low)
     state["time_budget"] = SETTINGS["fixed_budget"]
     if state["time_budget"] is None:
-        state["time_budget"] = SETTINGS["dt_min"] + 0.5 * (unit[-1] + 1.0) * (SETTINGS["dt_max"] - SETTINGS["dt_min"])
+        steps = SETTINGS["dt_min"] + 0.5 * (unit[-1] + 1.0) * (SETTINGS["dt_max"] - SETTINGS["dt_min"])
+        state["time_budget"] = max(np.rint(steps), 1.0) if SETTINGS["whole_budgets"] else steps
     state["elapsed"] = 0
 
 

@@ -108,6 +108,8 @@ def _high(g: _Graph, policy: ExportedPolicy) -> tuple[str, str]:
         return subgoal, g.constant([[policy.fixed_budget]], np.float64)
     span = 0.5 * (policy.dt_max - policy.dt_min)
     budget = g.affine(g.slice(unit, d, d + 1), span, policy.dt_min + span, np.float64)
+    if policy.whole_budgets:
+        budget = g("Max", g("Round", budget), g.constant([[1.0]], np.float64))
     return subgoal, budget
 
 

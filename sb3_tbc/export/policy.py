@@ -127,6 +127,7 @@ class ExportedPolicy:
     dt_min: float
     dt_max: float
     window_end: str
+    whole_budgets: bool  # whether time budgets are rounded to whole steps
     event: int | None  # entry of the observation whose flag ends an option
     memory: str
     achieved_in_observation: bool
@@ -192,6 +193,7 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
         dt_min=float(rules.dt_min),
         dt_max=float(rules.dt_max),
         window_end=rules.window_end,
+        whole_budgets=rules.whole_budgets,
         event=subgoals.event,
         memory=model.config.memory,
         achieved_in_observation=layout.achieved_in_observation,

@@ -201,7 +201,8 @@ class SubgoalReplayBuffer(RingBuffer):
         expired = second == at[where]
         if self.hindsight == "timed":
             ahead = (second - at[where]) % self.buffer_size
-            time_left[where, 0] = ahead + 1 - self.rng.random(len(where), dtype=np.float32)
+            early = self.rng.random(len(where), dtype=np.float32)
+            time_left[where, 0] = ahead + 1 - (0.0 if self.rules.whole_budgets else early)
         here, achieved = taken["here"], taken["achieved"]
         rewards[where, 0], dones[where, 0] = self._relabelled(here[where], achieved[where], subgoal[where], expired)
         scale = np.float32(1.0 / self.rules.dt_max)

@@ -156,7 +156,7 @@ def relabel_actions(
         ends = np.array([option.start + option.duration for option in episode.options])[failed]
         durations = np.array([option.duration for option in episode.options])[failed]
         reached = subgoals.achieved(_rows(episode, ends))
-        took = durations - rng.random(len(durations))
+        took = rules.budget_that_lasted(durations, rng)
         unit = subgoals.scale(reached)
         if tolerance is not None:
             success = hindsight_success(unit, np.clip(unit, -1.0, 1.0), tolerance)

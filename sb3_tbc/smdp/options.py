@@ -34,6 +34,8 @@ class OptionRules:
     :param max_options: high-level decisions allowed per episode; when they are used up the episode ends as a failure
     :param window_end: ``"timed"`` runs every window to the end of its budget (HiTS), ``"reached"`` also ends it when
         the subgoal is reached (paper, algorithm 1 line 20)
+    :param whole_budgets: round time budgets to the nearest whole number of steps, at least 1 (paper section 4.1); else
+        a fractional budget lasts until the first whole step that is not shorter
     :raises ValueError: if a number is out of range or ``window_end`` is unknown
     """
 
@@ -41,6 +43,7 @@ class OptionRules:
     dt_min: float = 0.0
     max_options: int = 20
     window_end: str = "timed"
+    whole_budgets: bool = False
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.dt_min < self.dt_max:
@@ -78,7 +81,12 @@ class OptionRules:
 
     def budget(self, unit: FloatArray) -> FloatArray:
         """Time budget in steps of a unit action coordinate in [-1, 1]."""
-        return np.asarray(self.dt_min + 0.5 * (unit + 1.0) * (self.dt_max - self.dt_min))
+        steps = self.dt_min + 0.5 * (unit + 1.0) * (self.dt_max - self.dt_min)
+        return np.maximum(np.rint(steps), 1.0) if self.whole_budgets else np.asarray(steps)
+
+    def budget_that_lasted(self, steps: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Time budgets that expire after just so many steps, drawn uniformly before they are rounded, ``(n,)``."""
+        return np.asarray(steps + (0.5 if self.whole_budgets else 0.0) - rng.random(len(steps)))
 
     def unit_budget(self, steps: FloatArray) -> FloatArray:
         """Unit action coordinate of a time budget, clipped to [-1, 1]."""

@@ -48,7 +48,7 @@ def make_rules(config: TBCConfig, episode_length: int | None) -> OptionRules:
         if episode_length is None:
             raise ValueError("dt_max=-1 needs an environment with max_episode_steps; pass dt_max in steps")
         dt_max = max(episode_length / config.max_options, 1.0)  # shorter episodes need fewer decisions than allowed
-    return OptionRules(dt_max, config.dt_min, config.max_options, config.window_end)
+    return OptionRules(dt_max, config.dt_min, config.max_options, config.window_end, config.whole_budgets)
 
 
 def make_views(config: TBCConfig, subgoals: SubgoalSpace, achieved_in_observation: bool) -> LevelViews:

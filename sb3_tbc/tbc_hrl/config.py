@@ -56,6 +56,9 @@ class AgentConfig(Settings):
     """Shortest time budget, environment steps."""
     dt_max: Annotated[float, Range(1, also=(-1,))] = -1.0
     """Longest time budget, environment steps; -1: the episode's length divided by ``max_options``."""
+    whole_budgets: bool = False
+    """Round time budgets to the nearest whole number of steps, as the paper does (section 4.1); else a fractional
+    budget lasts until the first step that is not shorter."""
     duration: Literal["joint", "rule", "fixed"] = "joint"
     """Who sets the time budget: the high level together with the subgoal, the rule of equation 1
     (``clip(kappa * H_reach, dt_min, dt_max)``), or nobody: it is always ``fixed_duration``."""

@@ -30,7 +30,8 @@ class FixedWindows:
                 f"got {steps}"
             )
         # half a step less than whole, so that no rounding error adds a step
-        self.unit = float(rules.unit_budget(np.array(math.ceil(steps) - 0.5)))
+        whole = round(steps) if rules.whole_budgets else math.ceil(steps) - 0.5
+        self.unit = float(rules.unit_budget(np.array(whole)))
 
     def __call__(self, unit_actions: FloatArray, observation: GoalObservation) -> FloatArray:
         """Append the time budget to unit subgoals ``(n, subgoal_dim)``."""

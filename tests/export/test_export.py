@@ -44,6 +44,7 @@ REFLEX = {**PENDULUM, "sensory_to": ["inter", "command", "motor"]}
 CASES = {
     "reached": ("Pendulum", {"window_end": "reached", "memory": "window"}),
     "relative": ("UR5Reacher", {"window_end": "reached", "relative_subgoals": True, "memory": "episode", "dt_min": 3}),
+    "whole": ("Pendulum", {"whole_budgets": True, "memory": "window"}),
     "mlp": ("Pendulum", {"window_end": "timed", "memory": "none", "low": {"policy_kwargs": {"ndbc": None}}}),
     "memoryless": ("Pendulum", {"memory": "none"}),
     "hac": ("Pendulum", {}),

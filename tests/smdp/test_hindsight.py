@@ -166,6 +166,26 @@ def test_relabelled_low_level_samples_are_consistent() -> None:
     np.testing.assert_array_equal(batch.dones[0, :, 0].numpy(), rewards)
 
 
+def test_whole_budgets_are_rounded_and_last_as_long_as_they_say() -> None:
+    whole = OptionRules(dt_max=4.0, dt_min=0.0, whole_budgets=True)
+    np.testing.assert_array_equal(whole.budget(np.array([-1.0, -0.6, -0.3, 0.1, 0.3, 1.0])), [1, 1, 1, 2, 3, 4])
+    steps = np.repeat([1.0, 2.0, 3.0, 4.0], 500)
+    unit = whole.unit_budget(whole.budget_that_lasted(steps, np.random.default_rng(0)))
+    np.testing.assert_array_equal(whole.budget(unit), steps)
+    fractional = OptionRules(dt_max=4.0)
+    lasted = fractional.budget(fractional.unit_budget(fractional.budget_that_lasted(steps, np.random.default_rng(0))))
+    np.testing.assert_array_equal(np.ceil(lasted), steps)
+
+
+def test_relabelled_remaining_time_is_whole_where_budgets_are() -> None:
+    rules = OptionRules(dt_max=4.0, max_options=5, whole_budgets=True)
+    buffer = low_buffer(100, hindsight=1e9, rules=rules)
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, rules))
+    observations = buffer.sample_burst(1, 500).observations[0].numpy()
+    position, subgoal, left = observations[:, 0], observations[:, 3], observations[:, 4] * rules.dt_max
+    np.testing.assert_allclose(left, np.rint((subgoal - position) / 0.1), atol=1e-5)
+
+
 def test_plain_low_level_samples_are_what_was_stored() -> None:
     buffer = low_buffer(100, hindsight=0)
     buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))

@@ -103,6 +103,7 @@ def test_paper_is_what_the_text_says(task: str) -> None:
     said = {
         "window_end": "reached",  # algorithm 1, line 20
         "duration": "joint",  # section 4.1
+        "whole_budgets": True,  # section 4.1
         "low_reward": "dense",  # section 4.1: "updated at every step"
         "target": "smdp",
         "memory": "window",

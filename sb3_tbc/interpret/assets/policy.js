@@ -50,7 +50,8 @@ class TwoLevels {
     const unit = x.map((a) => Math.fround(Math.tanh(Math.min(Math.max(Math.fround(a), -bound), bound))));
     const span = (low, high, u) => low + 0.5 * (u + 1) * (high - low);
     this.subgoal = this.p.subgoal_low.map((low, i) => span(low, this.p.subgoal_high[i], unit[i]));
-    this.budget = this.p.fixed_budget ?? span(this.p.dt_min, this.p.dt_max, unit[n]);
+    const steps = span(this.p.dt_min, this.p.dt_max, unit[n]);
+    this.budget = this.p.fixed_budget ?? (this.p.whole_budgets ? Math.max(Math.round(steps), 1) : steps);
     this.elapsed = 0;
     this.used += 1;
   }
