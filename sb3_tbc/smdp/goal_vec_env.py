@@ -7,10 +7,13 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.env_util import is_wrapped
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tbc.smdp.faults import fault
+from sb3_tbc.smdp.goal_spaces import goal_space_problems
 from sb3_tbc.smdp.spaces import GoalObservation
 
 
@@ -20,6 +23,13 @@ class RunningEpisode(NamedTuple):
     seed: int | None  # that the reset was given, or
     generator: dict[str, Any]  # the state of the task's random generator before the reset
     actions: list[NDArray[Any]]  # taken since
+
+
+def in_goal_vec_env(env: gym.Env[Any, Any] | VecEnv) -> gym.Env[Any, Any] | VecEnv:
+    """A single goal environment, monitored, as a :class:`GoalVecEnv`; anything else as it is."""
+    if isinstance(env, VecEnv) or goal_space_problems(env.observation_space):
+        return env
+    return GoalVecEnv([lambda: env if is_wrapped(env, Monitor) else Monitor(env)])
 
 
 class GoalVecEnv(DummyVecEnv):

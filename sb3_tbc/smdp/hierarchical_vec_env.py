@@ -43,6 +43,7 @@ class HierarchicalStep(NamedTuple):
 
     observations: FloatArray  # (n_envs, low_dim), the low level's, of the next options where windows ended
     window_over: BoolArray  # (n_envs,)
+    actions: NDArray[Any]  # (n_envs, action_dim), in the task's units
     task_observations: GoalObservation  # the task's, after automatic resets
     task_rewards: FloatArray  # (n_envs,), the task's
     episode_over: BoolArray  # (n_envs,)
@@ -191,7 +192,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
             if last is not None:
                 _tell_low_level(where, last, infos)
         low = self._low_observation(observation)  # type: ignore[arg-type]
-        return HierarchicalStep(low, over, observation, task_rewards, dones, infos, rewards, episodes)  # type: ignore[arg-type]
+        return HierarchicalStep(low, over, actions, observation, task_rewards, dones, infos, rewards, episodes)  # type: ignore[arg-type]
 
     def _refuse_bad(self, seen: GoalObservation, rewards: FloatArray | None = None) -> None:
         """Let nothing in that is not finite.

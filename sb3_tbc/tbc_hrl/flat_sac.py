@@ -5,24 +5,37 @@ from __future__ import annotations
 import io
 import pathlib
 import warnings
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
 from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import DictReplayBufferSamples, GymEnv
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.type_aliases import (
+    DictReplayBufferSamples,
+    GymEnv,
+    MaybeCallback,
+    TrainFreq,
+    TrainFrequencyUnit,
+)
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.sac.policies import MultiInputPolicy
 
 from sb3_tbc.files import write_arrays
+from sb3_tbc.replay.both_levels import MORE
+from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.smdp.hindsight import check_goal_strategy
+from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSettings, takes
+from sb3_tbc.tbc_hrl.calls import whole_steps
 from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.environment import attribute_of
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
+
+SelfFlatSAC = TypeVar("SelfFlatSAC", bound="FlatSAC")
 
 CYCLE = 100
 """Environment steps between two bursts of updates."""
@@ -84,6 +97,8 @@ class FlatSAC(PlainAlgorithm, SAC):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
     config_class: ClassVar[type[FlatConfig]] = FlatConfig
+    stop_requested: bool
+    """Set it to make :meth:`learn` return as soon as all is at a point to go on from exactly."""
     __signature__ = SignatureOfSettings(SB3Arguments)
 
     @takes(FlatArguments)
@@ -92,6 +107,9 @@ class FlatSAC(PlainAlgorithm, SAC):
         config = self.config_class.from_dict(settings)
         self.settings = config.to_dict()
         self.gradient_ratio = config.gradient_ratio
+        self._updated_at, self._owed = 0, 0.0
+        self._resumed: dict[str, Any] = {}
+        self.stop_requested = False
         by_event = config.goal_strategy == "event"
         super().__init__(
             policy,  # type: ignore[arg-type]
@@ -105,7 +123,7 @@ class FlatSAC(PlainAlgorithm, SAC):
             buffer_size=config.buffer_size,
             learning_starts=config.learning_starts,
             train_freq=(CYCLE, "step"),
-            gradient_steps=max(round(CYCLE * config.gradient_ratio), 1),
+            gradient_steps=1,  # see _update
             replay_buffer_class=TerminatingHerReplayBuffer,
             replay_buffer_kwargs={
                 "n_sampled_goal": config.n_hindsight_goals,
@@ -125,44 +143,133 @@ class FlatSAC(PlainAlgorithm, SAC):
         if sb3._init_setup_model:
             self._setup_model()
 
-    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
-        """As SAC's, once there is a finished episode to take goals from."""
-        buffer = self.replay_buffer
-        if isinstance(buffer, HerReplayBuffer) and buffer.ep_length.any():
-            super().train(gradient_steps, batch_size)
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """A vector of environments; single ones in one whose episodes can be resumed."""
+        return SAC._wrap_env(in_goal_vec_env(env) if monitor_wrapper else env, verbose, monitor_wrapper)
+
+    def learn(
+        self: SelfFlatSAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "SAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfFlatSAC:
+        """Collect :data:`CYCLE` steps, then update in a burst, until ``total_timesteps`` steps are done.
+
+        As with the two-level agents, several short calls learn what one long one does, and setting
+        :attr:`stop_requested` makes it return between two cycles' parts, never in the middle of a burst.
+
+        :raises ValueError: without an environment, or if ``total_timesteps`` is negative
+        :raises TypeError: if ``total_timesteps`` is not a whole number
+        """
+        total_timesteps = whole_steps(total_timesteps)
+        if self.env is None:
+            raise ValueError("learn needs an environment: pass env to load, or call set_env first")
+        resumed, self._resumed = {} if reset_num_timesteps else self._resumed, {}
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        if reset_num_timesteps:
+            self._updated_at, self._owed = 0, 0.0
+        if resumed:
+            resume.set_flat_state(self, self.env, resumed)
+        callback.on_training_start(locals(), globals())
+        while True:
+            if self.num_timesteps - self._updated_at >= CYCLE:
+                self._update()
+            left = min(total_timesteps - self.num_timesteps, CYCLE - (self.num_timesteps - self._updated_at))
+            if left <= 0 or self.stop_requested:
+                break
+            if not self._collect(-(-left // self.n_envs), callback, log_interval):
+                break
+        callback.on_training_end()
+        return self
+
+    def _collect(self, steps: int, callback: BaseCallback, log_interval: int) -> bool:
+        """Step every environment so often; False if a callback asks to stop."""
+        assert self.env is not None
+        rollout = self.collect_rollouts(
+            self.env,
+            callback,
+            TrainFreq(steps, TrainFrequencyUnit.STEP),
+            self._her_buffer(),
+            self.action_noise,
+            self.learning_starts,
+            log_interval,
+        )
+        return bool(rollout.continue_training)
+
+    def _update(self) -> None:
+        """Update as often as ``gradient_ratio`` and the steps since the last time say; what is left stays owed.
+
+        Without a finished episode there are no goals to take in hindsight: those updates wait.
+        """
+        steps = max(self.num_timesteps - max(self._updated_at, self.learning_starts), 0)
+        self._updated_at = self.num_timesteps
+        self._owed += self.gradient_ratio * steps
+        updates = int(self._owed)
+        if updates and self._her_buffer().ep_length.any():
+            self._owed -= updates
+            self.train(updates, self.batch_size)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """Write the replay buffer as plain arrays, atomically."""
+        """Write the replay buffer, and all else that learning goes on from, to one file of plain arrays.
+
+        A model saved at the same moment, loaded together with this file, goes on learning with
+        ``learn(..., reset_num_timesteps=False)`` as if it had never stopped, bit for bit.
+        """
         buffer = self._her_buffer()
         arrays: dict[str, Any] = {name: getattr(buffer, name) for name in ARRAYS}
         for part in ("observations", "next_observations"):
             arrays |= {f"{part}.{key}": array for key, array in getattr(buffer, part).items()}
         rows = buffer.buffer_size if buffer.full else buffer.pos
         arrays = {name: array[:rows] for name, array in arrays.items()}
-        write_arrays(path, {**arrays, "_start": buffer._current_ep_start, "pos": buffer.pos, "full": buffer.full})
+        more = {f"{MORE}.{name}": array for name, array in resume.get_flat_state(self).items()}
+        held = {"_start": buffer._current_ep_start, "pos": buffer.pos, "full": buffer.full}
+        write_arrays(path, {**arrays, **held, **more})
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what :meth:`save_replay_buffer` wrote; only plain arrays are read, never pickled objects.
 
-        :param truncate_last_traj: close the episode that was running when the buffer was saved
+        :param truncate_last_traj: close the episode that was running when the buffer was saved, if it cannot be gone
+            on with
         :raises ValueError: if the file was written for other spaces or a larger buffer
         """
+        if not isinstance(getattr(self, "replay_buffer", None), HerReplayBuffer) and self.env is not None:
+            self.replay_buffer = TerminatingHerReplayBuffer(
+                self.buffer_size, self.observation_space, self.action_space, env=self.env, device=self.device,
+                n_envs=self.n_envs, **self.replay_buffer_kwargs,
+            )  # fmt: skip
         buffer = self._her_buffer()
         with np.load(path, allow_pickle=False) as arrays:
             rows = len(arrays["actions"])
             for name in arrays.files:
                 part, _, key = name.partition(".")
-                if key or name in ARRAYS:
+                if part != MORE and (key or name in ARRAYS):
                     held = getattr(buffer, part)[key] if key else getattr(buffer, name)
                     if rows > len(held) or held.shape[1:] != arrays[name].shape[1:]:
                         raise ValueError(f"saved replay buffer does not fit: {name} has shape {arrays[name].shape}")
                     held[:rows] = arrays[name]
             buffer._current_ep_start[:] = arrays["_start"]
             buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
-        if truncate_last_traj and (buffer._current_ep_start != buffer.pos).any():
+            more = [name for name in arrays.files if name.startswith(f"{MORE}.")]
+            self._resumed = {name.removeprefix(f"{MORE}."): arrays[name] for name in more}
+        if truncate_last_traj and not resume.can_go_on(self, self._resumed):
+            self.close_running_episodes()
+
+    def close_running_episodes(self) -> None:
+        """Let the episodes that run end where they are: what was stored of them is used, the rest never comes."""
+        buffer = self._her_buffer()
+        if (buffer._current_ep_start != buffer.pos).any():
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # SB3 warns of what was just asked for
                 buffer.truncate_last_trajectory()
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_resumed", "stop_requested"]
 
     def _her_buffer(self) -> HerReplayBuffer:
         if not isinstance(self.replay_buffer, HerReplayBuffer):

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+import torch as th
 from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.arrays import Arrays
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import NDBCActor
 from sb3_tbc.replay.both_levels import Replay
@@ -18,8 +21,12 @@ from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.reachability import Reachability
 
+if TYPE_CHECKING:
+    from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+
 logger = logging.getLogger(__name__)
-Arrays = dict[str, NDArray[Any]]
+NOT_KNOWN = "the environments begin new episodes: what ran in them when the run was saved is not known"
+ELSEWHERE = "the environments begin new episodes: living through the saved ones led elsewhere"
 
 
 class LearningState(NamedTuple):
@@ -68,9 +75,8 @@ def get_state(learning: LearningState) -> Arrays:
         plain["circuit"] = {"updates": actor.net.updates, "sub_steps": actor.net.sub_steps}
         arrays["direction"] = actor.net.lipschitz.direction.numpy().copy()
     if learning.collector is not None and isinstance(learning.collector.env.venv, GoalVecEnv):
-        running = learning.collector.env.venv.running
-        plain["episodes"] = [{"seed": episode.seed, "generator": episode.generator} for episode in running]
-        arrays |= {f"actions.{i}": np.array(episode.actions) for i, episode in enumerate(running)}
+        plain["episodes"], actions = _running(learning.collector.env.venv)
+        arrays |= actions
         arrays |= {f"collector.{name}": array for name, array in learning.collector.get_state().items()}
     return {**arrays, "plain": np.array(json.dumps(plain))}
 
@@ -109,11 +115,63 @@ def set_state(learning: LearningState, state: Mapping[str, NDArray[Any]]) -> boo
 def _relive(collector: Collector, plain: Mapping[str, Any], state: Mapping[str, NDArray[Any]]) -> None:
     venv, starts = collector.env.venv, plain.get("episodes", [])
     if not isinstance(venv, GoalVecEnv) or len(starts) != venv.num_envs:
-        logger.warning("the environments begin new episodes: what ran in them when the run was saved is not known")
+        logger.warning(NOT_KNOWN)
         return
-    running = [RunningEpisode(**start, actions=list(state[f"actions.{i}"])) for i, start in enumerate(starts)]
-    observation = venv.relive(running)
+    observation = venv.relive(_episodes(starts, state))
     held = {name.partition(".")[2]: array for name, array in state.items() if name.startswith("collector.")}
     if not collector.set_state(held, observation):
-        logger.warning("the environments begin new episodes: living through the saved ones led elsewhere")
+        logger.warning(ELSEWHERE)
         collector.reset()
+
+
+def _running(venv: GoalVecEnv) -> tuple[list[dict[str, Any]], Arrays]:
+    """How the running episodes began, and the actions taken since."""
+    starts = [{"seed": episode.seed, "generator": episode.generator} for episode in venv.running]
+    return starts, {f"actions.{i}": np.array(episode.actions) for i, episode in enumerate(venv.running)}
+
+
+def _episodes(starts: list[dict[str, Any]], state: Mapping[str, NDArray[Any]]) -> list[RunningEpisode]:
+    return [RunningEpisode(**start, actions=list(state[f"actions.{i}"])) for i, start in enumerate(starts)]
+
+
+# -- the flat agent ----------------------------------------------------------------------------------------------------
+
+
+def get_flat_state(model: FlatSAC) -> Arrays:
+    """As :func:`get_state`. SB3's SAC draws from the generators of torch and NumPy that all code shares."""
+    _, keys, *rest = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
+    plain: dict[str, Any] = {
+        "timesteps": int(model.num_timesteps),
+        "numpy": rest,
+        "action_space": model.action_space.np_random.bit_generator.state,
+    }
+    arrays: Arrays = {"numpy": np.asarray(keys), "torch": th.get_rng_state().numpy()}
+    if isinstance(model.env, GoalVecEnv) and isinstance(model._last_obs, dict):
+        plain["episodes"], actions = _running(model.env)
+        arrays |= actions | {f"last.{key}": np.array(part) for key, part in model._last_obs.items()}
+    return {**arrays, "plain": np.array(json.dumps(plain))}
+
+
+def can_go_on(model: FlatSAC, state: Mapping[str, NDArray[Any]]) -> bool:
+    """Whether a saved run's episodes can be gone on with."""
+    plain = json.loads(str(state["plain"])) if "plain" in state else {}
+    known = isinstance(model.env, GoalVecEnv) and len(plain.get("episodes", ())) == model.n_envs
+    return known and plain["timesteps"] == model.num_timesteps
+
+
+def set_flat_state(model: FlatSAC, env: VecEnv, state: Mapping[str, NDArray[Any]]) -> None:
+    """Go on where :func:`get_flat_state` was taken; where that cannot be, new episodes begin, and the log says so."""
+    if not can_go_on(model, state) or not isinstance(env, GoalVecEnv):
+        logger.warning(NOT_KNOWN)
+        return
+    plain = json.loads(str(state["plain"]))
+    seen = env.relive(_episodes(plain["episodes"], state))
+    if not all(np.array_equal(seen[key], state[f"last.{key}"]) for key in seen):
+        logger.warning(ELSEWHERE)
+        model.close_running_episodes()
+        model._last_obs = env.reset()  # type: ignore[assignment]
+        return
+    model._last_obs = dict(seen)
+    th.set_rng_state(th.from_numpy(state["torch"].copy()))
+    np.random.set_state(("MT19937", state["numpy"], *plain["numpy"]))  # noqa: NPY002
+    model.action_space.np_random.bit_generator.state = plain["action_space"]

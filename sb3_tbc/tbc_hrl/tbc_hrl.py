@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -16,12 +16,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import safe_mean
-from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.settings import hints
 from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.goal_spaces import check_goal_space
+from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
+from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep
 from sb3_tbc.smdp.hindsight import check_goal_strategy
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.smdp.rewards import LowLevelReward
@@ -29,6 +31,7 @@ from sb3_tbc.tbc_hrl import assembly, resume
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
+from sb3_tbc.tbc_hrl.calls import refuse_vec_normalize, whole_steps
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, goal_test_of
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of
@@ -92,6 +95,9 @@ class TBCHRL(PlainAlgorithm):
         self.reward_range: RewardRange | None = None
         self._n_updates = 0
         self._updated_at = 0
+        self._owed: dict[str, float] = {}  # parts of updates, by who is owed them
+        self._burst_due = False  # an episode was stored since the last updates
+        self.stop_requested = False
         self.collector: Collector | None = None
         self._resumed: dict[str, Any] = {}
         if others._init_setup_model:
@@ -168,10 +174,7 @@ class TBCHRL(PlainAlgorithm):
 
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""
-        if unwrap_vec_normalize(env) is not None:
-            raise ValueError(
-                "VecNormalize moves the subgoal space while the agent learns; use the task's fixed scales instead"
-            )
+        refuse_vec_normalize(env)
         if self.subgoals is None:
             self.subgoals = attribute_of(env, "subgoals")
         check_goal_strategy(self.config.goal_strategy, self.subgoals)
@@ -181,7 +184,26 @@ class TBCHRL(PlainAlgorithm):
             self.episode_length = episode_length(env)
         self.reward_range = reward_range(env)
 
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """A vector of environments; single ones in one whose episodes can be resumed."""
+        return BaseAlgorithm._wrap_env(in_goal_vec_env(env) if monitor_wrapper else env, verbose, monitor_wrapper)
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Learn in another environment from now on, see SB3; episodes that run in the present one are left.
+
+        :raises ValueError: if the environment does not fit the agent
+        """
+        if isinstance(env, VecEnv):
+            refuse_vec_normalize(env)
+        super().set_env(env, force_reset)
+        self.collector, self._resumed = None, {}
+
     # ------------------------------------------------------------------ learning
+
+    stop_requested: bool
+    """Set it, from a signal handler or another thread, to make :meth:`learn` return as soon as all is at a point to go
+    on from exactly; it stays set until it is taken back."""
 
     @property
     def actor(self) -> TwoLevelActor:
@@ -197,36 +219,63 @@ class TBCHRL(PlainAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfTBCHRL:
-        """Collect whole episodes, then update both levels in a burst, until ``total_timesteps`` steps are done."""
+        """Collect whole episodes, then update both levels in a burst, until ``total_timesteps`` steps are done.
+
+        With ``reset_num_timesteps=False`` running episodes, open options and updates that are owed go on from the last
+        call: several short calls learn what one long one does. Updates follow finished episodes only, so that those
+        owed for the steps of an episode that is cut off by the end of a call are done in the next.
+
+        Setting :attr:`stop_requested` makes it return between two steps, never in the middle of a burst.
+
+        :raises ValueError: without an environment, or if ``total_timesteps`` is negative
+        :raises TypeError: if ``total_timesteps`` is not a whole number
+        """
         self._refuse_foreign_high("learn")
+        total_timesteps = whole_steps(total_timesteps)
+        if self.env is None:
+            raise ValueError("learn needs an environment: pass env to load, or call set_env first")
         resumed, self._resumed = {} if reset_num_timesteps else self._resumed, {}
         planned = total_timesteps + (self.num_timesteps if resumed else 0)
+        anew = reset_num_timesteps or self._last_obs is None  # then SB3 resets the environments
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        if self.env is None:
-            raise ValueError("learn needs an environment: call set_env first")
         if reset_num_timesteps:
-            self._updated_at = 0
-        for level in (self.high, self.low):
-            level.set_logger(self.logger)
-        explore = assembly.exploration(self.config)
-        self.collector = collector = Collector(
-            self.env, self.actor, self.layout, self.rules, self.rng, self.schedule, explore
-        )
-        collector.reset()
-        if resumed:
-            resume.set_state(self._moving_parts(), resumed)
+            self._updated_at, self._owed, self._burst_due = 0, {}, False
+        collector = self._collect_from(self.env, anew, resumed)
         callback.on_training_start(locals(), globals())
         self._prepare_updates(planned, progress_bar_of(callback))
-        while self.num_timesteps < total_timesteps:
+        while True:
+            self._update_if_due(log_interval)
+            if self.num_timesteps >= total_timesteps or self.stop_requested:
+                break
             if not self.collect_rollouts(collector, callback, total_timesteps):
                 break
-            self.train()
-            if log_interval and self._episode_num % log_interval == 0:
-                self.dump_logs()
         callback.on_training_end()
         return self
+
+    def _collect_from(self, env: VecEnv, anew: bool, resumed: Mapping[str, Any]) -> Collector:
+        """What acts in the environments: the one that did so before, unless they begin new episodes.
+
+        :param anew: they were just reset
+        :param resumed: what was loaded of a saved run
+        """
+        if anew or self.collector is None:
+            explore = assembly.exploration(self.config)
+            self.collector = Collector(env, self.actor, self.layout, self.rules, self.rng, self.schedule, explore)
+            self.collector.begin(self._last_obs if anew else env.reset())  # type: ignore[arg-type]
+        if resumed:
+            resume.set_state(self._moving_parts(), resumed)
+        return self.collector
+
+    def _update_if_due(self, log_interval: int | None) -> None:
+        """Update both levels if an episode was stored since the last time."""
+        if not self._burst_due:
+            return
+        self.train()
+        self._burst_due = False
+        if log_interval and self._episode_num % log_interval == 0:
+            self.dump_logs()
 
     def _prepare_updates(self, total_timesteps: int, bar: Any | None) -> None:
         """Compile now; the progress bar says so, and the logged speed does not count it.
@@ -235,6 +284,7 @@ class TBCHRL(PlainAlgorithm):
         :param bar: the progress bar, if there is one
         """
         for level, config in ((self.high, self.config.high), (self.low, self.config.low)):
+            level.set_logger(self.logger)
             name, few = level.log_prefix[:-1], self._updates_of(config, total_timesteps) < MIN_UPDATES_TO_COMPILE
             compile = False if self.config.compile == "auto" and few else self.config.compile
             with described(bar, f"compiling the {name} level's update" if compile else ""):
@@ -246,43 +296,69 @@ class TBCHRL(PlainAlgorithm):
     def collect_rollouts(self, collector: Collector, callback: BaseCallback, total_timesteps: int) -> bool:
         """Act until an episode is over (or the steps are used up) and store it; False if a callback asks to stop."""
         callback.on_rollout_start()
-        episodes: dict[int, Episode] = {}
-        while not episodes and self.num_timesteps < total_timesteps:
+        while not self._burst_due and self.num_timesteps < total_timesteps and not self.stop_requested:
             step = collector.step()
-            episodes, infos = step.episodes, step.infos
+            self._last_obs = step.task_observations  # type: ignore[assignment]
             self.num_timesteps += self.n_envs
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-            self._update_info_buffer(infos, step.episode_over)
-            callback.update_locals(locals())
+            self._update_info_buffer(step.infos, step.episode_over)
+            self._store(step.episodes.values(), collector.env.venv)
+            callback.update_locals(self._as_sb3_names(step))
             if not callback.on_step():
                 return False
-        for episode in episodes.values():
-            self._episode_num += 1
-            self.diagnostics.add(episode, self.store.add(episode, goal_test_of(collector.env.venv)))
         callback.on_rollout_end()
         return True
 
+    def _store(self, episodes: Iterable[Episode], venv: VecEnv) -> None:
+        """Put finished episodes into the replay buffers; updates follow."""
+        for episode in episodes:
+            self._episode_num += 1
+            self._burst_due = True
+            self.diagnostics.add(episode, self.store.add(episode, goal_test_of(venv)))
+
+    def _as_sb3_names(self, step: HierarchicalStep) -> dict[str, Any]:
+        """What SB3's algorithms show their callbacks of a step: the task's side of it, episodes and not windows."""
+        return {
+            "self": self, "env": self.env, "replay_buffer": self.replay_buffer, "actions": step.actions,
+            "new_obs": step.task_observations, "rewards": step.task_rewards, "dones": step.episode_over,
+            "infos": step.infos, "episodes": step.episodes,
+        }  # fmt: skip
+
     def train(self) -> None:
-        """Update both levels as often as ``gradient_ratio`` and the steps since the last time say."""
-        steps = self.num_timesteps - self._updated_at
+        """Update both levels as often as ``gradient_ratio`` and the steps since the last time say.
+
+        What is less than an update, or has to wait until a buffer holds a batch, stays owed.
+        """
+        steps = max(self.num_timesteps - max(self._updated_at, self.config.learning_starts), 0)
         self._updated_at = self.num_timesteps
-        if self.num_timesteps <= self.config.learning_starts:
-            return
         levels = zip((self.high, self.low), self.replay_buffer, (self.config.high, self.config.low), strict=True)
         for level, buffer, config in levels:
-            updates = self._updates_of(config, steps)
+            updates = self._owed_updates(level.log_prefix, self._ratio_of(config) * steps)
             if updates and buffer.size() >= config.batch_size:
+                self._owed[level.log_prefix] -= updates
                 level._current_progress_remaining = self._current_progress_remaining
                 level.train(updates, config.batch_size)
         self._n_updates = self.low._n_updates
-        if self.reachability is not None:
-            loss = self.reachability.train_on(self.replay_buffer.low, max(steps // UPDATE_EVERY, 1))
+        if self.reachability is not None and steps:
+            updates = self._owed_updates("reachability", steps / UPDATE_EVERY)
+            self._owed["reachability"] -= updates
+            loss = self.reachability.train_on(self.replay_buffer.low, updates)
             self.logger.record("reachability/loss", loss)
+
+    def _owed_updates(self, name: str, more: float) -> int:
+        """Whole updates owed by now.
+
+        :param more: that are owed for the steps since the last time
+        """
+        self._owed[name] = self._owed.get(name, 0.0) + more
+        return int(self._owed[name])
 
     def _updates_of(self, level: LevelConfig, steps: int) -> int:
         """How often a level with these settings is updated for so many environment steps."""
-        ratio = self.config.gradient_ratio if level.gradient_ratio is None else level.gradient_ratio
-        return int(ratio * steps)
+        return int(self._ratio_of(level) * steps)
+
+    def _ratio_of(self, level: LevelConfig) -> float:
+        return float(self.config.gradient_ratio if level.gradient_ratio is None else level.gradient_ratio)
 
     def dump_logs(self) -> None:
         """Write what was seen since the last time: SB3's keys, and per level what explains learning."""
@@ -356,6 +432,7 @@ class TBCHRL(PlainAlgorithm):
             *super()._excluded_save_params(),
             "high", "low", "config", "rng", "layout", "rules", "high_reward", "low_level_reward", "store",
             "diagnostics", "replay_buffer", "schedule", "reachability", "collector", "_resumed",
+            "stop_requested",
         ]  # fmt: skip
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

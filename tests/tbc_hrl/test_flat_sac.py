@@ -1,0 +1,115 @@
+"""The flat baseline: as many updates as asked for, resumed to the bit, learnt in chunks, stopped at any time."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from corridor import Corridor
+from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+
+
+def make(n_envs: int = 1, **kwargs: Any) -> FlatSAC:
+    env = GoalVecEnv([lambda: Monitor(Corridor(30)) for _ in range(n_envs)])
+    given = {"batch_size": 16, "gradient_ratio": 0.15, "policy_kwargs": {"net_arch": [8, 8]}, "seed": 0}
+    return FlatSAC("MultiInputPolicy", env, **{**given, **kwargs})
+
+
+def contents(model: FlatSAC) -> dict[str, Any]:
+    buffer: Any = model.replay_buffer
+    found = {key: value.numpy().copy() for key, value in model.policy.state_dict().items()}
+    for name in ("actor", "critic"):
+        moments = getattr(model.policy, name).optimizer.state_dict()["state"]
+        found |= {f"{name}.{i}.{key}": part.numpy().copy() for i, m in moments.items() for key, part in m.items()}
+    rows = buffer.pos
+    found |= {f"replay.{key}": part[:rows].copy() for key, part in buffer.observations.items()}
+    found |= {"actions": buffer.actions[:rows].copy(), "ends": buffer.dones[:rows].copy()}
+    return {**found, "updates": model._n_updates, "steps": model.num_timesteps, "episodes": model._episode_num}
+
+
+def assert_same(first: dict[str, Any], second: dict[str, Any]) -> None:
+    assert first.keys() == second.keys()
+    for key, value in first.items():
+        np.testing.assert_array_equal(second[key], value, err_msg=key)
+
+
+@pytest.mark.parametrize("n_envs", [1, 8])
+def test_does_the_updates_asked_for(n_envs: int) -> None:
+    model = make(n_envs, gradient_ratio=1.0, learning_starts=0).learn(800)
+    assert abs(model._n_updates - 800) <= 100  # a burst's steps at most are still to come
+    assert model._n_updates == model._updated_at
+    idle = make(n_envs, gradient_ratio=0.0).learn(400)
+    assert idle._n_updates == 0
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_chunks_learn_what_one_call_learns(n_envs: int) -> None:
+    expected = contents(make(n_envs).learn(480))
+    for chunks in ([240, 240], [100, 2, 6, 212, 160], [20] * 24):
+        model = make(n_envs)
+        for steps in chunks:
+            model.learn(steps, reset_num_timesteps=False)
+        assert_same(expected, contents(model))
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize("half_way", [300, 450])
+def test_goes_on_bit_for_bit(n_envs: int, half_way: int, tmp_path: Any) -> None:
+    from sb3_tbc.zoo.environments import make_envs
+
+    def agent() -> FlatSAC:
+        given: dict[str, Any] = {"batch_size": 16, "gradient_ratio": 0.1, "policy_kwargs": {"net_arch": [8, 8]}}
+        return FlatSAC("MultiInputPolicy", make_envs("sb3_tbc/UR5Reacher-v0", n_envs, 0), seed=0, **given)
+
+    expected = contents(agent().learn(2 * half_way))
+    half = agent().learn(half_way)
+    half.save(tmp_path / "model.zip")
+    half.save_replay_buffer(tmp_path / "replay.npz")
+    loaded = FlatSAC.load(tmp_path / "model.zip", env=make_envs("sb3_tbc/UR5Reacher-v0", n_envs, 9))
+    loaded.load_replay_buffer(tmp_path / "replay.npz")
+    th.manual_seed(1)
+    np.random.seed(1)  # noqa: NPY002
+    assert_same(expected, contents(loaded.learn(half_way, reset_num_timesteps=False)))
+
+
+def test_other_vectors_begin_new_episodes_and_say_so(tmp_path: Any, caplog: Any) -> None:
+    model = FlatSAC("MultiInputPolicy", DummyVecEnv([Corridor]), batch_size=16, seed=0).learn(130)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "replay.npz")
+    loaded = FlatSAC.load(tmp_path / "model.zip", env=DummyVecEnv([Corridor]))
+    del loaded.replay_buffer
+    loaded.load_replay_buffer(tmp_path / "replay.npz")
+    loaded.learn(100, reset_num_timesteps=False)
+    assert "begin new episodes" in caplog.text
+    assert loaded.num_timesteps == 230
+    assert loaded.replay_buffer is not None
+
+
+class StopAt(BaseCallback):
+    def _on_step(self) -> bool:
+        self.model.stop_requested |= self.num_timesteps >= 130
+        return True
+
+
+def test_stops_when_asked_and_goes_on_exactly() -> None:
+    expected = contents(make().learn(400))
+    model = make().learn(400, callback=StopAt())
+    assert 130 <= model.num_timesteps < 400
+    model.stop_requested = False
+    assert_same(expected, contents(model.learn(400 - model.num_timesteps, reset_num_timesteps=False)))
+
+
+def test_sb3s_callbacks_and_clear_refusals() -> None:
+    model = make().learn(5000, callback=StopTrainingOnMaxEpisodes(5))
+    assert model._episode_num in (4, 5)
+    with pytest.raises(TypeError, match="got '1000'"):
+        model.learn("1000")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="got -5"):
+        model.learn(-5)
