@@ -18,6 +18,7 @@ from sb3_tbc.smdp.episode_limit import ANNOUNCE, BUDGET_EXHAUSTED, LastWindow, c
 from sb3_tbc.smdp.faults import step_or_name
 from sb3_tbc.smdp.finite import all_finite, refusal
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, width
+from sb3_tbc.smdp.goal_test import EpisodeJudge
 from sb3_tbc.smdp.options import Episode, OptionClock, OptionRules, TerminationReason
 from sb3_tbc.smdp.recorder import EpisodeRecorder
 from sb3_tbc.smdp.spaces import GoalObservation
@@ -89,6 +90,7 @@ class HierarchicalVecEnv(VecEnvWrapper):
         self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
         ends_early = rules.ends_when_reached or layout.subgoals.event is not None
         self._task_can_tell = ends_early and can_tell(venv, layout.subgoals)
+        self.judge = EpisodeJudge(venv)
         self._started = False
         self._given: NDArray[Any] = np.zeros(0)  # what step_async was given
 
@@ -259,8 +261,8 @@ class HierarchicalVecEnv(VecEnvWrapper):
 
     def _finish_episode(self, index: int, info: dict[str, Any]) -> Episode:
         truncated, exhausted = info.get("TimeLimit.truncated", False), info.get(BUDGET_EXHAUSTED, False)
-        success = bool(info.get("is_success", False)) and not exhausted
-        return self._recorder.finish(index, not truncated, success, bool(exhausted))
+        success = info["is_success"] = self.judge.succeeded(info)
+        return self._recorder.finish(index, not truncated, success and not exhausted, bool(exhausted))
 
     def _begin_episodes(self, where: Indices, observation: GoalObservation) -> None:
         self.clock.begin_episode(where)

@@ -182,16 +182,3 @@ class EpisodeStore:
         )
         self.replay.high.extend(steps)
         return steps
-
-
-def goal_test_of(venv: VecEnv) -> GoalTest:
-    """The task's own reward and termination, asked of the first environment (as SB3's HER does)."""
-
-    def ask(method: str, achieved: FloatArray, desired: FloatArray) -> NDArray[Any]:
-        answer = venv.env_method(method, achieved, desired, {}, indices=[0])[0]
-        return np.broadcast_to(np.asarray(answer), (len(achieved),))
-
-    return GoalTest(
-        lambda a, d: ask("compute_reward", a, d).astype(np.float64),
-        lambda a, d: ask("compute_terminated", a, d).astype(bool),
-    )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.goal_test import EpisodeJudge
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
@@ -64,6 +65,7 @@ def evaluate_flat(
 ) -> EvaluationResult:
     """As :func:`evaluate_hierarchical`, for an agent without subgoals: these figures are NaN, decisions are 0."""
     venv = _vector(env, n_eval_episodes)
+    judge = EpisodeJudge(venv)
     if seed is not None:
         venv.seed(seed)
     observation = venv.reset()
@@ -75,8 +77,7 @@ def evaluate_flat(
         observation, rewards, dones, infos = venv.step(actions)
         totals += np.stack([np.ones(venv.num_envs), rewards])
         for index in np.flatnonzero(dones):
-            success = bool(infos[index].get("is_success", False))
-            results[index].append((success, *totals[:, index], np.nan, np.nan, 0, False))
+            results[index].append((judge.succeeded(infos[index]), *totals[:, index], np.nan, np.nan, 0, False))
             totals[:, index] = 0.0
     return _columns([rows[i] for i in range(per_env) for rows in results], n_eval_episodes)
 

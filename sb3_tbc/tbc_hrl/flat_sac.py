@@ -25,6 +25,8 @@ from stable_baselines3.sac.policies import MultiInputPolicy
 
 from sb3_tbc.files import write_arrays
 from sb3_tbc.replay.both_levels import MORE
+from sb3_tbc.smdp.goal_spaces import check_goal_space
+from sb3_tbc.smdp.goal_test import check_goal_test, goal_test_of
 from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.smdp.hindsight import check_goal_strategy
 from sb3_tbc.tbc_hrl import resume
@@ -79,8 +81,7 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
             raise ValueError("hindsight replay needs the environment's goal test; pass env when loading")
         reached = samples.next_observations["achieved_goal"].cpu().numpy()
         wanted = samples.observations["desired_goal"].cpu().numpy()
-        over = self.env.env_method("compute_terminated", reached, wanted, {}, indices=[0])[0]
-        dones = np.broadcast_to(np.asarray(over), (len(reached),)).astype(np.float32)
+        dones = goal_test_of(self.env).terminated(reached, wanted).astype(np.float32)
         return samples._replace(dones=th.from_numpy(dones).reshape(-1, 1).to(self.device))
 
 
@@ -138,6 +139,9 @@ class FlatSAC(PlainAlgorithm, SAC):
             seed=sb3.seed,
             _init_setup_model=False,
         )
+        if self.env is not None:
+            check_goal_space(self.env.observation_space, self.env.action_space)
+            check_goal_test(self.env)
         if by_event and self.env is not None:
             check_goal_strategy(config.goal_strategy, attribute_of(self.env, "subgoals"))
         if sb3._init_setup_model:
@@ -174,8 +178,8 @@ class FlatSAC(PlainAlgorithm, SAC):
         )
         if reset_num_timesteps:
             self._updated_at, self._owed = 0, 0.0
-        if resumed:
-            resume.set_flat_state(self, self.env, resumed)
+        if resumed and not resume.set_flat_state(self, self.env, resumed):
+            self.close_running_episodes()
         callback.on_training_start(locals(), globals())
         while True:
             if self.num_timesteps - self._updated_at >= CYCLE:

@@ -65,6 +65,23 @@ class TBCPolicy(BasePolicy):
         self.views, self.rules, self.memory, self.schedule = views, rules, memory, schedule
         self.unit: Any = UnitActions(action_space)
         self.rng = np.random.default_rng(seed)
+        for level in (self.high_policy, self.low_policy):
+            level.register_load_state_dict_post_hook(_read_again)  # type: ignore[no-untyped-call]
+
+    def save(self, path: str) -> None:
+        """Refused: the two levels are parts of an agent.
+
+        :raises TypeError: always, naming what to save
+        """
+        raise TypeError("a policy of two levels is saved with its agent: use model.save(path) and TBCHRL.load(path)")
+
+    @classmethod
+    def load(cls, path: str, device: th.device | str = "auto") -> TBCPolicy:
+        """Refused, see :meth:`save`.
+
+        :raises TypeError: always, naming what to load
+        """
+        raise TypeError("a policy of two levels is loaded with its agent: use TBCHRL.load(path).policy")
 
     def initial_state(self, n_envs: int) -> TwoLevelState:
         """State of ``n_envs`` environments that have not begun an option."""
@@ -161,3 +178,8 @@ class TBCPolicy(BasePolicy):
 
 def _packed(clock: OptionClock, membrane: FloatArray) -> TwoLevelState:
     return TwoLevelState(**{name: getattr(clock, name) for name in OptionClock.carried}, membrane=membrane)
+
+
+def _read_again(level: Any, _: Any) -> None:
+    """Let a level act from weights that were just loaded into it."""
+    level.after_updates(0)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.arrays import Arrays
@@ -20,9 +21,6 @@ from sb3_tbc.smdp.goal_vec_env import GoalVecEnv, RunningEpisode
 from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.reachability import Reachability
-
-if TYPE_CHECKING:
-    from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 
 logger = logging.getLogger(__name__)
 NOT_KNOWN = "the environments begin new episodes: what ran in them when the run was saved is not known"
@@ -137,7 +135,7 @@ def _episodes(starts: list[dict[str, Any]], state: Mapping[str, NDArray[Any]]) -
 # -- the flat agent ----------------------------------------------------------------------------------------------------
 
 
-def get_flat_state(model: FlatSAC) -> Arrays:
+def get_flat_state(model: OffPolicyAlgorithm) -> Arrays:
     """As :func:`get_state`. SB3's SAC draws from the generators of torch and NumPy that all code shares."""
     _, keys, *rest = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
     plain: dict[str, Any] = {
@@ -152,26 +150,29 @@ def get_flat_state(model: FlatSAC) -> Arrays:
     return {**arrays, "plain": np.array(json.dumps(plain))}
 
 
-def can_go_on(model: FlatSAC, state: Mapping[str, NDArray[Any]]) -> bool:
+def can_go_on(model: OffPolicyAlgorithm, state: Mapping[str, NDArray[Any]]) -> bool:
     """Whether a saved run's episodes can be gone on with."""
     plain = json.loads(str(state["plain"])) if "plain" in state else {}
     known = isinstance(model.env, GoalVecEnv) and len(plain.get("episodes", ())) == model.n_envs
     return known and plain["timesteps"] == model.num_timesteps
 
 
-def set_flat_state(model: FlatSAC, env: VecEnv, state: Mapping[str, NDArray[Any]]) -> None:
-    """Go on where :func:`get_flat_state` was taken; where that cannot be, new episodes begin, and the log says so."""
+def set_flat_state(model: OffPolicyAlgorithm, env: VecEnv, state: Mapping[str, NDArray[Any]]) -> bool:
+    """Go on where :func:`get_flat_state` was taken; False if living through the saved episodes led elsewhere.
+
+    Those are then over, and new ones begin, which the log says; as it does where nothing is known of them.
+    """
     if not can_go_on(model, state) or not isinstance(env, GoalVecEnv):
         logger.warning(NOT_KNOWN)
-        return
+        return True
     plain = json.loads(str(state["plain"]))
     seen = env.relive(_episodes(plain["episodes"], state))
     if not all(np.array_equal(seen[key], state[f"last.{key}"]) for key in seen):
         logger.warning(ELSEWHERE)
-        model.close_running_episodes()
         model._last_obs = env.reset()  # type: ignore[assignment]
-        return
+        return False
     model._last_obs = dict(seen)
     th.set_rng_state(th.from_numpy(state["torch"].copy()))
     np.random.set_state(("MT19937", state["numpy"], *plain["numpy"]))  # noqa: NPY002
     model.action_space.np_random.bit_generator.state = plain["action_space"]
+    return True

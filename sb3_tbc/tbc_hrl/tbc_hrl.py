@@ -22,9 +22,10 @@ from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.settings import hints
 from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.goal_spaces import check_goal_space
+from sb3_tbc.smdp.goal_test import check_goal_test
 from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep
-from sb3_tbc.smdp.hindsight import check_goal_strategy
+from sb3_tbc.smdp.hindsight import GoalTest, check_goal_strategy
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.smdp.rewards import LowLevelReward
 from sb3_tbc.tbc_hrl import assembly, resume
@@ -32,7 +33,7 @@ from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.calls import refuse_vec_normalize, whole_steps
-from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore, goal_test_of
+from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of
 from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, mismatch_explained, reward_range
@@ -183,6 +184,7 @@ class TBCHRL(PlainAlgorithm):
         if self.episode_length is None:
             self.episode_length = episode_length(env)
         self.reward_range = reward_range(env)
+        check_goal_test(env)
 
     @staticmethod
     def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
@@ -302,19 +304,19 @@ class TBCHRL(PlainAlgorithm):
             self.num_timesteps += self.n_envs
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._update_info_buffer(step.infos, step.episode_over)
-            self._store(step.episodes.values(), collector.env.venv)
+            self._store(step.episodes.values(), collector.env.judge.goal_test)
             callback.update_locals(self._as_sb3_names(step))
             if not callback.on_step():
                 return False
         callback.on_rollout_end()
         return True
 
-    def _store(self, episodes: Iterable[Episode], venv: VecEnv) -> None:
+    def _store(self, episodes: Iterable[Episode], goal_test: GoalTest) -> None:
         """Put finished episodes into the replay buffers; updates follow."""
         for episode in episodes:
             self._episode_num += 1
             self._burst_due = True
-            self.diagnostics.add(episode, self.store.add(episode, goal_test_of(venv)))
+            self.diagnostics.add(episode, self.store.add(episode, goal_test))
 
     def _as_sb3_names(self, step: HierarchicalStep) -> dict[str, Any]:
         """What SB3's algorithms show their callbacks of a step: the task's side of it, episodes and not windows."""

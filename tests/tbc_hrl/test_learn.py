@@ -165,7 +165,7 @@ def test_learning_resets_the_environments_once() -> None:
             resets[0] += 1
             return super().reset(**kwargs)
 
-    model = TBCHRL("MultiInputPolicy", Counting(), high=LEVEL, low=LEVEL, max_options=5, compile=False, seed=0)
+    model = TBCHRL("MultiInputPolicy", Counting(goal=5.0), high=LEVEL, low=LEVEL, max_options=5, compile=False, seed=0)
     model.learn(10)
     assert resets == [1]
     model.learn(10, reset_num_timesteps=False)

@@ -1,0 +1,120 @@
+"""A task's own reward and end, asked of achieved and desired goals, as learning in hindsight asks for them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from copy import deepcopy
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_tbc.arrays import BoolArray, FloatArray
+from sb3_tbc.errors import ConfigError, NonFiniteError
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
+from sb3_tbc.smdp.hindsight import GoalTest
+
+TRIED = 3
+"""Goals for which a task's functions are tried at once before learning begins."""
+
+
+def goal_test_of(venv: VecEnv) -> GoalTest:
+    """The task's reward and termination, asked of the first environment, as SB3's hindsight replay does.
+
+    A task needs ``compute_reward(achieved_goal, desired_goal, info)`` alone, for batches; ``info`` is empty. Without
+    ``compute_terminated`` a goal ends the task where its reward is as high as that of the goal itself.
+    """
+
+    def ask(method: str, achieved: FloatArray, desired: FloatArray) -> NDArray[Any]:
+        answer = np.asarray(venv.env_method(method, achieved, desired, {}, indices=[0])[0])
+        if answer.shape != (len(achieved),):
+            raise ConfigError(
+                f"{method}(achieved_goal, desired_goal, info) must give one value for each of {len(achieved)} goals, "
+                f"got shape {answer.shape}. Vectorise it: goals are arrays (n, goal_dim)"
+            )
+        return answer
+
+    def reward(achieved: FloatArray, desired: FloatArray) -> FloatArray:
+        rewards = ask("compute_reward", achieved, desired).astype(np.float64)
+        if not np.isfinite(rewards).all():
+            row = int(np.flatnonzero(~np.isfinite(rewards))[0])
+            raise NonFiniteError(
+                f"compute_reward gives {rewards[row]} for achieved_goal {achieved[row].tolist()} and desired_goal "
+                f"{desired[row].tolist()}"
+            )
+        return rewards
+
+    def as_good_as_the_goal(achieved: FloatArray, desired: FloatArray) -> BoolArray:
+        return np.asarray(reward(achieved, desired) >= reward(desired, desired))
+
+    def terminated(achieved: FloatArray, desired: FloatArray) -> BoolArray:
+        return ask("compute_terminated", achieved, desired).astype(bool)
+
+    return GoalTest(reward, terminated if venv.has_attr("compute_terminated") else as_good_as_the_goal)
+
+
+def check_goal_test(venv: VecEnv) -> None:
+    """Try the calls that learning makes, on goals from the task's own goal space, before anything is learnt.
+
+    :raises ConfigError: if the task does not have the functions, or they do not take batches
+    """
+    if not venv.has_attr("compute_reward"):
+        raise ConfigError(
+            "the environment has no compute_reward(achieved_goal, desired_goal, info), which learning in hindsight "
+            "needs; derive it from gymnasium_robotics.core.GoalEnv"
+        )
+    space = deepcopy(check_goal_space(venv.observation_space)["achieved_goal"])
+    space.seed(0)
+    achieved, desired = (np.stack([space.sample() for _ in range(TRIED)]).astype(np.float64) for _ in range(2))
+    try:
+        test = goal_test_of(venv)
+        test.reward(achieved, desired)
+        test.terminated(achieved, desired)
+    except (ConfigError, NonFiniteError):
+        raise
+    except Exception as error:  # a task's own code may fail in any way
+        raise ConfigError(
+            f"compute_reward or compute_terminated fails on a batch of {TRIED} goals with an empty info: "
+            f"{type(error).__name__}: {error}. Learning in hindsight asks for rewards of goals that were never the "
+            "task's, of whose steps there is no info"
+        ) from error
+
+
+class EpisodeJudge:
+    """Says whether episodes ended at their goals.
+
+    :param venv: the environments
+    """
+
+    def __init__(self, venv: VecEnv) -> None:
+        self._venv = venv
+        self._warned = False
+
+    @cached_property
+    def goal_test(self) -> GoalTest:
+        """The task's own reward and end for any goals."""
+        return goal_test_of(self._venv)
+
+    def succeeded(self, info: Mapping[str, Any]) -> bool:
+        """What the task says of an episode's last step, else what its functions say of the last goals.
+
+        :param info: of the step that ended the episode
+        """
+        said = info.get("is_success", info.get("success"))
+        if said is not None:
+            return bool(said)
+        if self._venv.has_attr("compute_reward"):
+            last = info["terminal_observation"]
+            achieved, desired = (np.asarray(last[key], dtype=np.float64)[None] for key in GOAL_KEYS[1:])
+            return bool(self.goal_test.terminated(achieved, desired)[0])
+        if not self._warned:
+            warnings.warn(
+                "the environment does not say whether its episodes succeed (no info['is_success'], no compute_reward): "
+                "a success rate of 0 means that nothing is known",
+                stacklevel=2,
+            )
+            self._warned = True
+        return False
