@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Mapping
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol
 
 from sb3_tbc.campaign.jobs import Job
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 
 
@@ -135,12 +137,16 @@ class SlurmExecutor:
     :param settings: for submitit, e.g. ``{"slurm_partition": "short", "timeout_min": 600}``
     :param cluster: ``"slurm"``, or ``"local"`` to try submitit without a cluster
     :raises MissingExtraError: without submitit
+    :raises ConfigError: where there is no Slurm, or for a setting that submitit does not know
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any], cluster: str = "slurm") -> None:
         submitit = require("submitit", extra="cluster", what="--executor slurm")
-        self.executor = submitit.AutoExecutor(folder=folder, cluster=cluster)
-        self.executor.update_parameters(**{"cpus_per_task": 1, "timeout_min": 24 * 60, **settings})
+        try:
+            self.executor = submitit.AutoExecutor(folder=folder, cluster=cluster)
+            self.executor.update_parameters(**{"cpus_per_task": 1, "timeout_min": 24 * 60, **settings})
+        except (RuntimeError, NameError, TypeError, ValueError) as error:
+            raise ConfigError(f"--executor slurm: {error}") from error
 
     def start(self, job: Job) -> SlurmHandle:
         """Submit a run."""
@@ -180,15 +186,23 @@ class RayExecutor:
 
     :param address: of the cluster; ``None`` for the one of this machine (``RAY_ADDRESS``), or a new one on it
     :raises MissingExtraError: without Ray
+    :raises ConfigError: if there is no cluster at the address
     """
 
     def __init__(self, address: str | None = None) -> None:
         self.ray = require("ray", extra="cluster", what="--executor ray")
         self.started = not self.ray.is_initialized()
         if self.started:
-            self.ray.init(address=address, log_to_driver=False, configure_logging=False)
+            _check_address(address or os.environ.get("RAY_ADDRESS"))
+            self._join(address)
         # Ray repeats a task whose machine died; the run then continues from its last checkpoint.
         self.run = self.ray.remote(num_cpus=1, max_retries=-1, retry_exceptions=False)(run_job)
+
+    def _join(self, address: str | None) -> None:
+        try:
+            self.ray.init(address=address, log_to_driver=False, configure_logging=False)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            raise ConfigError(f"--executor ray cannot join the cluster {address or ''}: {error}") from error
 
     def start(self, job: Job) -> RayHandle:
         """Put a run into the cluster's queue."""
@@ -198,3 +212,18 @@ class RayExecutor:
         """Leave the cluster, if we were not in it before."""
         if self.started:
             self.ray.shutdown()
+
+
+def _check_address(address: str | None) -> None:
+    """Ray ends the whole process when nobody answers at ``host:port``, so ask first.
+
+    :raises ConfigError: if nobody answers
+    """
+    host, _, port = (address or "").rpartition(":")
+    if not host or "/" in host or not port.isdecimal():
+        return
+    try:
+        socket.create_connection((host, int(port)), timeout=5.0).close()
+    except OSError as error:
+        cure = "start one with: ray start --head"
+        raise ConfigError(f"--executor ray: no cluster answers at {address} ({error}); {cure}") from error

@@ -21,6 +21,7 @@ from sb3_tbc.campaign.executors import LocalExecutor, SlurmExecutor, run_job
 from sb3_tbc.campaign.hours import hours_of, measured_speeds, plan
 from sb3_tbc.campaign.jobs import FAILED, Job
 from sb3_tbc.campaign.progress import Board
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import MissingExtraError
 from sb3_tbc.zoo.ledger import LEDGER_FILES, RunFolder
 
@@ -281,6 +282,15 @@ def test_without_submitit_the_extra_is_named(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setitem(sys.modules, "submitit", None)
     with pytest.raises(MissingExtraError, match=r"sb3_tbc\[cluster\]"):
         SlurmExecutor(tmp_path, {})
+
+
+def test_without_a_slurm_cluster_it_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ConfigError, match="--executor slurm: "):
+        SlurmExecutor(tmp_path / "slurm", {})
+    with pytest.raises(ConfigError, match="--executor slurm: "):
+        SlurmExecutor(tmp_path / "slurm", {"no_such_setting": 1}, cluster="local")
 
 
 def test_hours_from_measured_speeds(tmp_path: Path) -> None:

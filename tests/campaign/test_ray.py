@@ -17,6 +17,7 @@ from sb3_tbc import reproduce
 from sb3_tbc.campaign.campaign import Campaign
 from sb3_tbc.campaign.executors import RayExecutor
 from sb3_tbc.campaign.progress import Board
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import MissingExtraError
 
 STEPS = 3000
@@ -30,6 +31,12 @@ def test_without_ray_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=r"sb3_tbc\[cluster\]"):
         RayExecutor()
+
+
+def test_without_a_cluster_at_the_address(capfd: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("ray")
+    with pytest.raises(ConfigError, match=r"no cluster answers at 127\.0\.0\.1:1"):
+        RayExecutor("127.0.0.1:1")
 
 
 @pytest.fixture
