@@ -11,7 +11,7 @@ SEED ?= 0
 STEPS ?= $(if $(filter Pendulum,$(ENV)),100000,)
 RUN := runs/$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: help install browser train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks bench report pretrained clean
+.PHONY: help install browser train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks torture bench report pretrained clean
 
 help:
 	@echo "install          .venv with the package (editable) and what its tests need"
@@ -22,6 +22,7 @@ help:
 	@echo "check-codestyle  format and lint, no change  commit-checks format type lint"
 	@echo "report           the results page of the docs and the HTML report, from the ledger in results/"
 	@echo "doc notebooks    build the pages, run the notebooks        bench  steps per second"
+	@echo "torture          kill, stop, starve and damage runs: the table of docs/reliability.md, hours"
 	@echo "pretrained       train the agents that come with the package [TASKS=]"
 
 # The stamp is newer than the files that decide what is installed: nothing is done twice.
@@ -77,6 +78,9 @@ report: install
 
 notebooks: install
 	$(BIN)/python -m pytest -m "slow or not slow" tests/test_notebooks.py
+
+torture: install
+	$(BIN)/python scripts/torture.py all
 
 bench: install
 	$(BIN)/python scripts/bench.py

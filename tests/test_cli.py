@@ -227,7 +227,7 @@ def test_ctrl_c_saves_and_resume_finishes(
         (["--hyperparams", "env_kwargs:{observation: compct}"], "observation must be one of"),
         (["--hyperparams", "random_fraction:2"], "random_fraction must be a number from 0 to 1, got 2"),
         (["--ablation", "no-tz"], "no ablation 'no-tz'"),
-        (["--config-file", "nowhere.yml"], "cannot read configuration nowhere.yml"),
+        (["--config-file", "nowhere.yml"], "cannot read nowhere.yml: there is no such file"),
     ],
 )
 def test_mistakes_cost_one_line_and_write_nothing(

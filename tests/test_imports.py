@@ -17,6 +17,7 @@ PACKAGE = ROOT / "sb3_tbc"
 LAYERS = (
     ("former_names", "errors", "stats", "arrays"),
     ("files", "outside", "stopping", "settings"),
+    ("reading",),
     ("commands", "extras", "smdp"),
     ("replay", "ndbc", "tasks", "zoo_configs"),
     ("level",),

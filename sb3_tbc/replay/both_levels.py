@@ -7,10 +7,10 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.files import write_arrays
+from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 
 MORE = "running"
@@ -37,8 +37,11 @@ class Replay(NamedTuple):
         :return: the further arrays of the file
         :raises ValueError: if the file was written for other spaces or sizes
         """
-        with np.load(path, allow_pickle=False) as arrays:
+        arrays = read_arrays(path)
+        try:
             for name, buffer in self._asdict().items():
-                names = [key for key in arrays.files if key.startswith(f"{name}.")]
+                names = [key for key in arrays if key.startswith(f"{name}.")]
                 buffer.set_state({key.removeprefix(f"{name}."): arrays[key] for key in names})
-            return {k.removeprefix(f"{MORE}."): arrays[k] for k in arrays.files if k.startswith(f"{MORE}.")}
+        except (KeyError, TypeError, IndexError) as error:
+            raise ValueError(f"{path} is no saved replay buffer of such an agent: {error!r}") from error
+        return {k.removeprefix(f"{MORE}."): arrays[k] for k in arrays if k.startswith(f"{MORE}.")}

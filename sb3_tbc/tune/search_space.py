@@ -12,9 +12,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol
 
-import yaml
-
 from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.reading import read_yaml
 from sb3_tbc.tbc_hrl.config import CircuitConfig
 from sb3_tbc.zoo.config import RunConfig, merge
 from sb3_tbc.zoo.schema import CONFIG_CLASSES, RUN, coerce, validate
@@ -170,10 +169,7 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
 
     :raises ConfigError: if it cannot be read or is not sections of parameters
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise ConfigError(f"cannot read search space {path}: {error}") from error
+    data = read_yaml(path)
     if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
         raise ConfigError(f"{path}: expected sections of parameters (default and one per task)")
     sections: dict[str, dict[str, Any]] = coerce(data)

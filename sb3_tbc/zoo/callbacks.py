@@ -16,7 +16,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import explained, replacing, save_atomic, write_atomic
+from sb3_tbc.outside import one_line
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
@@ -56,7 +58,10 @@ def read_evaluations(path: Path) -> list[EvaluationRow]:
             raise ValueError(
                 f"{path} must have the columns {', '.join(EvaluationRow._fields)}, got {reader.fieldnames}"
             )
-        return [_parse_row(row) for row in reader]
+        try:
+            return [_parse_row(row) for row in reader]
+        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
+            raise ConfigError(f"{path} holds a line that is no evaluation: {one_line(error)}") from error
 
 
 def _parse_row(row: dict[str, str]) -> EvaluationRow:

@@ -8,9 +8,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.outside import one_line
+from sb3_tbc.reading import MAX_DEPTH, parse_yaml, read_yaml
 from sb3_tbc.zoo.schema import RUN, coerce, validate
 
 CONFIGS = ("paper", "tuned")
@@ -92,10 +92,7 @@ def read_file(path: Path, algo: str | None = None) -> dict[str, dict[str, Any]]:
     :param algo: algorithm whose settings they are; None allows those of any
     :raises ConfigError: if it cannot be read or holds an unknown key or a wrong value
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
-        raise ConfigError(f"cannot read configuration {path}: {error}") from error
+    data = read_yaml(path)
     if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
         raise ConfigError(f"{path}: expected sections of keys (default and one per task)")
     return {name: _checked(coerce(section), algo, f"{path.name}, section {name}") for name, section in data.items()}
@@ -123,10 +120,9 @@ def parse_overrides(items: Sequence[str]) -> dict[str, Any]:
             raise ConfigError(
                 f"--hyperparams takes key:value with dots for sections, e.g. low.gamma:0.98; got {item!r}"
             )
-        try:
-            value: Any = yaml.safe_load(text)
-        except yaml.YAMLError as error:
-            raise ConfigError(f"--hyperparams {item!r}: the value is not YAML") from error
+        if name.count(".") > MAX_DEPTH:
+            raise ConfigError(f"--hyperparams {one_line(item)!r}: more than {MAX_DEPTH} sections in one another")
+        value = parse_yaml(text, f"the value of --hyperparams {one_line(item)!r}")
         for key in reversed(name.split(".")):
             value = {key: value}
         result = merge(result, value)

@@ -6,7 +6,7 @@ import json
 import math
 import platform
 import subprocess
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import remove, remove_temporary, write_atomic
 from sb3_tbc.outside import flat_name, folder_name
+from sb3_tbc.reading import read_json, read_yaml
 from sb3_tbc.stats import stability, wilson_interval
 from sb3_tbc.zoo.callbacks import EvaluationRow, finite_mean, read_evaluations, write_evaluations
 from sb3_tbc.zoo.checkpoints import NEWEST, has_checkpoint, remove_checkpoints, remove_unfinished
@@ -218,14 +219,14 @@ class RunFolder:
 
         :raises ConfigError: if there is none or it cannot be read
         """
-        return _read(self.path / CONFIG, yaml.safe_load)
+        return _read(self.path / CONFIG, read_yaml)
 
     def read_final(self) -> dict[str, Any]:
         """The result.
 
         :raises ConfigError: if there is none or it cannot be read
         """
-        return _read(self.path / FINAL, json.loads)
+        return _read(self.path / FINAL, read_json)
 
     def read_evaluations(self) -> list[EvaluationRow]:
         """The learning curve, empty before the first evaluation."""
@@ -282,13 +283,10 @@ class RunFolder:
             write_atomic(target.path / name, (self.path / name).read_text(encoding="utf-8"))
 
 
-def _read(path: Path, parse: Any) -> dict[str, Any]:
-    try:
-        data = parse(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(f"{path.parent} holds no run: {path.name} is missing") from error
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"cannot read {path}: {error}") from error
+def _read(path: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
+    if not path.is_file():
+        raise ConfigError(f"{path.parent} holds no run: {path.name} is missing")
+    data = read(path)
     if not isinstance(data, dict):
         raise ConfigError(f"{path} must hold named values, got {type(data).__name__}")
     return data

@@ -240,7 +240,7 @@ def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dict[str, A
     env = make_envs(spec.env_id, spec.run.n_envs, spec.seed + done, spec.run.env_kwargs)
     try:
         model = load_model(checkpoint.model, env, options.device, options.trust)
-        model.load_replay_buffer(checkpoint.replay_buffer)
+        _load_replay(model, checkpoint.replay_buffer)
         keep_only(folder.path, checkpoint)
         with explained(folder.path):
             folder.reopen(done)
@@ -248,6 +248,13 @@ def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dict[str, A
         return Training(model, spec, folder, options, checkpoint.wall_time).run()
     finally:
         env.close()
+
+
+def _load_replay(model: Agent, path: Path) -> None:
+    try:
+        model.load_replay_buffer(path)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} does not belong to this run's agent: {one_line(error)}") from error
 
 
 class Training:

@@ -194,7 +194,7 @@ def test_mistakes_on_an_existing_study(
         (["--storage", "/proc/study.log"], "cannot open storage /proc/study.log"),
         (["--hyperparams", "random_fraction:2"], "random_fraction must lie in [0, 1]"),
         (["--search", "low.gama"], "matches no parameter"),
-        (["--search-space", "nowhere.yml"], "cannot read search space nowhere.yml"),
+        (["--search-space", "nowhere.yml"], "cannot read nowhere.yml: there is no such file"),
         (["--threshold", "0"], "--threshold is a success rate"),
         (["--trial", "best"], "no study"),
     ],

@@ -1,0 +1,134 @@
+"""Text files from outside: read within limits, and every way in which one can be wrong is one kind of error."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.outside import one_line
+
+MAX_BYTES = 4 * 2**20
+"""Largest text file that is read; configurations have some 10,000 bytes."""
+MAX_VALUES = 100_000
+"""Values that a YAML text may hold when its aliases are written out; a few hundred bytes can mean billions."""
+MAX_DEPTH = 50
+UNNAMED = ' in "<unicode string>"'
+MAX_GROWTH = 2000
+SMALL = 2**26
+"""A file of arrays may unpack to so many times its size, and this much more: replay is full of equal rows."""
+
+
+def read_text(path: Path) -> str:
+    """A text file.
+
+    :raises ConfigError: if it is missing, too large, or no UTF-8
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ConfigError(f"{path} has {path.stat().st_size} bytes; at most {MAX_BYTES} are read")
+        return path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ConfigError(f"cannot read {path}: there is no such file") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"cannot read {path}: it is no UTF-8 text ({error.reason} at byte {error.start})") from error
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot read {path}: {one_line(error)}") from error
+
+
+def parse_yaml(text: str, what: str) -> Any:
+    """Plain data of a YAML text; tags that would make other objects are refused.
+
+    :param what: what the text is, for messages
+    :raises ConfigError: if it is no YAML, or too large or too deep when its aliases are written out
+    """
+
+    def parse() -> Any:
+        loader = yaml.SafeLoader(text)
+        try:
+            node = loader.get_single_node()
+            if node is None:
+                return None
+            _size(node, {}, 0)
+            return loader.construct_document(node)
+        finally:
+            loader.dispose()
+
+    return _parsed(parse, what, "YAML")
+
+
+def read_yaml(path: Path) -> Any:
+    """Plain data of a YAML file.
+
+    :raises ConfigError: if it cannot be read
+    """
+    return parse_yaml(read_text(path), str(path))
+
+
+def read_json(path: Path) -> Any:
+    """Plain data of a JSON file.
+
+    :raises ConfigError: if it cannot be read
+    """
+    text = read_text(path)
+    return _parsed(lambda: json.loads(text), str(path), "JSON")
+
+
+def _parsed(parse: Callable[[], Any], what: str, form: str) -> Any:
+    try:
+        return parse()
+    except ConfigError:
+        raise
+    except RecursionError as error:
+        raise ConfigError(f"cannot read {what}: nested too deeply") from error
+    except Exception as error:  # dates, numbers and keys that make no sense raise many kinds
+        raise ConfigError(f"cannot read {what}: it is no {form}: {one_line(error).replace(UNNAMED, '')}") from error
+
+
+def _size(node: yaml.Node, known: dict[int, int], depth: int) -> int:
+    """Values in a node with its aliases written out.
+
+    :raises ConfigError: if they are too many, nested too deeply, or a node holds itself
+    """
+    if depth > MAX_DEPTH:
+        raise ConfigError("cannot read YAML: nested too deeply")
+    if id(node) in known:
+        if known[id(node)] < 0:
+            raise ConfigError("cannot read YAML: an alias refers to what it lies in")
+        return known[id(node)]
+    known[id(node)] = -1
+    inner = node.value if isinstance(node, yaml.CollectionNode) else []
+    parts = [part for item in inner for part in (item if isinstance(item, tuple) else (item,))]
+    size = 1 + sum(_size(part, known, depth + 1) for part in parts)
+    if size > MAX_VALUES:
+        raise ConfigError(f"cannot read YAML: more than {MAX_VALUES} values once its aliases are written out")
+    known[id(node)] = size
+    return size
+
+
+def read_arrays(path: Any) -> dict[str, NDArray[Any]]:
+    """The arrays of a file that :func:`~sb3_tbc.files.write_arrays` wrote; nothing is unpickled.
+
+    :param path: of the file, or an open file
+    :raises ValueError: if it is damaged, holds other things than plain arrays, or would unpack to far more than it is
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            sizes = [(member.compress_size, member.file_size) for member in archive.infolist()]
+            if sum(size for _, size in sizes) > MAX_GROWTH * sum(packed for packed, _ in sizes) + SMALL:
+                raise ValueError("it would unpack to far more than its size")
+        if hasattr(path, "seek"):
+            path.seek(0)
+        with np.load(path, allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except FileNotFoundError:
+        raise
+    except Exception as error:  # zipfile, zlib and NumPy raise many kinds for a broken file
+        raise ValueError(f"{path} is no whole file of arrays: {one_line(error)}") from error
