@@ -43,12 +43,12 @@ def make_rules(config: TBCConfig, episode_length: int | None) -> OptionRules:
     :param episode_length: time limit of the task, environment steps; None where it has none
     :raises ValueError: if ``dt_max`` is to be derived from an episode's length that is not known
     """
-    dt_max = config.dt_max
+    dt_max, max_options = config.dt_max, int(config.max_options)
     if dt_max == -1:
         if episode_length is None:
             raise ValueError("dt_max=-1 needs an environment with max_episode_steps; pass dt_max in steps")
-        dt_max = max(episode_length / config.max_options, 1.0)  # shorter episodes need fewer decisions than allowed
-    return OptionRules(dt_max, config.dt_min, config.max_options, config.window_end, config.whole_budgets)
+        dt_max = max(episode_length / max_options, 1.0)  # shorter episodes need fewer decisions than allowed
+    return OptionRules(dt_max, config.dt_min, max_options, config.window_end, config.whole_budgets)
 
 
 def make_views(config: TBCConfig, subgoals: SubgoalSpace, achieved_in_observation: bool) -> LevelViews:

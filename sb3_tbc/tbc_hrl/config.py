@@ -8,8 +8,8 @@ remembers. A new setting is one field here and the code that uses it. Settings o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal, Self
 
 from sb3_tbc.settings import Range, SettingError, Settings
 from sb3_tbc.tbc_hrl.level_config import (
@@ -44,12 +44,18 @@ __all__ = [
 ]
 
 
+WINDOW_STEPS = 10
+"""Steps that ``max_options: auto`` leaves to each decision: time for the low level to do something."""
+MOST_OPTIONS = 20
+"""And the most decisions that it allows, however long an episode is."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class AgentConfig(Settings):
     """Settings of an agent of two levels that are not of one level alone."""
 
-    max_options: Annotated[int, Range(1, 1_000_000)] = 20
-    """High-level decisions allowed per episode."""
+    max_options: Annotated[int, Range(1, 1_000_000)] | Literal["auto"] = 20
+    """High-level decisions allowed per episode; ``auto``: as many as leave ten steps to each, at most 20."""
     window_end: Literal["timed", "reached"] = "timed"
     """What ends a window: its time budget alone (HiTS), or reaching the subgoal as well (algorithm 1)."""
     dt_min: NotNegative = 0.0
@@ -116,6 +122,20 @@ class AgentConfig(Settings):
     """Show the low level the distance to its subgoal instead of the subgoal itself."""
     compile: bool | Literal["auto"] = "auto"
     """Compile the updates; ``auto``: where a C++ compiler is found and the run is long enough to gain."""
+
+    def for_episodes_of(self, steps: int | None) -> Self:
+        """These settings with ``max_options`` as a number.
+
+        :param steps: time limit of the task; None where it has none
+        :raises SettingError: if ``max_options`` is to be derived from a time limit that there is not
+        """
+        if self.max_options != "auto":
+            return self
+        if steps is None:
+            raise SettingError(
+                "max_options", "of 'auto' needs an environment with a time limit; say how many decisions"
+            )
+        return replace(self, max_options=min(max(steps // WINDOW_STEPS, 1), MOST_OPTIONS))
 
     def check(self) -> None:
         """Refuse what cannot be meant together."""

@@ -141,7 +141,8 @@ class TBCHRL(PlainAlgorithm):
             self._read_environment(self.env)
         if self.subgoals is None:
             raise ValueError("no subgoal space: pass subgoals=SubgoalSpace(...), or an environment that has .subgoals")
-        config, subgoals = self.config, self.subgoals
+        self.config = config = self.config.for_episodes_of(self.episode_length)
+        subgoals = self.subgoals
         seeds = np.random.SeedSequence(self.seed).generate_state(7).tolist()
         self.rng = np.random.default_rng(seeds[0])
         self.rules = assembly.make_rules(config, self.episode_length)

@@ -14,6 +14,8 @@ from sb3_tbc.reading import MAX_DEPTH, parse_yaml, read_yaml
 from sb3_tbc.zoo.schema import RUN, coerce, validate
 
 CONFIGS = ("paper", "tuned")
+OTHER = "other"
+"""Section of configuration files for environments that have none of their own."""
 ABLATIONS: dict[str, dict[str, Any]] = {
     "no-ts": {"duration": "fixed", "remaining_time": False, "target": "decision", "duration_loss_coef": 0.0},
     "no-ndbc": {"low": {"policy_kwargs": {"ndbc": None}}, "sequence_length": 1},
@@ -140,7 +142,7 @@ def load_config(
     """The configuration of one run.
 
     :param algo: algorithm name, which is also the name of the shipped file
-    :param task: section to use; an environment without a section runs on the defaults
+    :param task: section to use; an environment without a section of its own takes the one named ``other``
     :param config: ``paper``, ``tuned``, or ``None`` for ``tuned`` where there is such a sub-section
     :param overrides: what the command line changes, as :func:`parse_overrides` gives it
     :param ablation: name of an ablation
@@ -149,7 +151,7 @@ def load_config(
     """
     path = path or config_file(algo)
     sections = read_file(path, algo)
-    default, section = dict(sections.get("default", {})), dict(sections.get(task, {}))
+    default, section = dict(sections.get("default", {})), dict(sections.get(task, sections.get(OTHER, {})))
     tuned = merge(default.pop("tuned", {}), section.pop("tuned", {}))
     config = config or ("tuned" if tuned else "paper")
     if config not in CONFIGS:

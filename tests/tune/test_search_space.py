@@ -14,7 +14,7 @@ from sb3_tbc.tune.search_space import Parameter, apply, build_space, complete, l
 from sb3_tbc.zoo.config import config_file, load_config, parse_overrides, read_file
 
 ALGOS = ("tbc-hrl", "hits", "hac", "sac")
-TASKS = sorted(set(read_file(config_file("tbc-hrl"))) - {"default"})
+TASKS = sorted(set(read_file(config_file("tbc-hrl"))) - {"default", "other"})
 TABLE_A1 = {"inter", "command", "motor", "sensory_fanout", "inter_fanout", "recurrent_command_synapses", "motor_fanin"}
 
 
@@ -162,9 +162,8 @@ def test_an_unknown_task_gets_the_agents_own_circuit() -> None:
     circuit = complete(load_config("tbc-hrl", "Other-v0"), 3).model["low"]["policy_kwargs"]["ndbc"]
     assert circuit["motor"] == 3
     assert set(circuit) >= TABLE_A1 | {"sub_steps"}
-    assert (
-        project(build_space(load_space("tbc-hrl", "Other-v0")), load_config("tbc-hrl", "Other-v0"))["max_options"] == 20
-    )
+    start = project(build_space(load_space("tbc-hrl", "Other-v0")), load_config("tbc-hrl", "Other-v0"))
+    assert "max_options" not in start  # it follows from the task's time limit; the search draws one
     hits = load_config("hits", "Other-v0")
     assert complete(hits, 3) == hits
 

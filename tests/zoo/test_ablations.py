@@ -11,7 +11,7 @@ from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import ABLATIONS, config_file, load_config, read_file
 from sb3_tbc.zoo.environments import make_envs, task_names
 
-TASKS = sorted(set(read_file(config_file("tbc-hrl"))) - {"default"})
+TASKS = sorted(set(read_file(config_file("tbc-hrl"))) - {"default", "other"})
 
 
 def test_mlp_parameters() -> None:

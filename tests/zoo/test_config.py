@@ -235,7 +235,21 @@ def test_a_run_configuration_survives_yaml() -> None:
 
 @pytest.mark.parametrize("algo", [*sorted(COLUMN), "sac"])
 def test_every_shipped_section_is_a_task(algo: str) -> None:
-    assert set(read_file(config_file(algo))) == {"default", *TASKS}
+    others = set() if algo == "sac" else {"other"}
+    assert set(read_file(config_file(algo))) == {"default", *others, *TASKS}
+
+
+@pytest.mark.parametrize("algo", ["tbc-hrl", "hits", "hac"])
+def test_other_environments_have_a_section_of_their_own(algo: str) -> None:
+    assert load_config(algo, "FetchReach-v4").model["max_options"] == "auto"
+    assert all(isinstance(load_config(algo, task).model["max_options"], int) for task in TASKS)
+
+
+def test_what_is_tuned_for_other_environments_stays_with_them() -> None:
+    tuned, paper = (load_config("tbc-hrl", "FetchReach-v4", config).model for config in ("tuned", "paper"))
+    assert tuned["relative_subgoals"]
+    assert "relative_subgoals" not in paper
+    assert "relative_subgoals" not in load_config("tbc-hrl", "Pendulum").model
 
 
 @pytest.mark.parametrize("config", ["paper", "tuned"])

@@ -1,4 +1,4 @@
-"""From an agent's settings and its task to bounds, norms and optimism of both levels."""
+"""From an agent's settings and its task to decisions, bounds, norms and optimism of both levels."""
 
 import logging
 import math
@@ -9,8 +9,10 @@ import pytest
 from making import make
 
 from sb3_tbc import TBCHRL
+from sb3_tbc.settings import SettingError
 from sb3_tbc.smdp.bounds import ValueBounds
 from sb3_tbc.tbc_hrl.baselines import HAC
+from sb3_tbc.tbc_hrl.config import TBCConfig
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}, "batch_size": 16}
 
@@ -94,3 +96,20 @@ def test_learns_saves_and_loads(tmp_path) -> None:
     observation, _ = make("Pendulum").reset(seed=1)
     ours, theirs = (a.predict(observation, deterministic=True)[0] for a in (agent, loaded))
     assert np.array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize(("steps", "options"), [(50, 5), (300, 20), (1000, 20), (7, 1), (100, 10)])
+def test_decisions_follow_the_time_limit(steps: int, options: int) -> None:
+    config = TBCConfig(max_options="auto")
+    assert config.for_episodes_of(steps).max_options == options
+    assert TBCConfig(max_options=3).for_episodes_of(steps).max_options == 3
+    with pytest.raises(SettingError, match="max_options of 'auto' needs an environment with a time limit"):
+        config.for_episodes_of(None)
+
+
+def test_an_agent_takes_its_decisions_from_the_task(tmp_path) -> None:
+    agent = make_agent(make("Pendulum"), max_options="auto")
+    assert agent.max_options == agent.rules.max_options == 20
+    assert agent.rules.dt_max == pytest.approx(agent.episode_length / 20)
+    agent.save(tmp_path / "agent.zip")
+    assert TBCHRL.load(tmp_path / "agent.zip").max_options == 20
