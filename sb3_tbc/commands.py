@@ -45,7 +45,8 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
     def _get_help_string(self, action: argparse.Action) -> str | None:
         text = action.help
-        unsaid = action.default in (None, False, [], argparse.SUPPRESS) or action.option_strings == []
+        nothing = any(action.default is value for value in (None, False, argparse.SUPPRESS)) or action.default == []
+        unsaid = nothing or not action.option_strings
         if text is None or unsaid or "default" in text:
             return text
         return f"{text} (default: %(default)s)"

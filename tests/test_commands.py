@@ -73,6 +73,7 @@ def test_every_option_says_what_it_is_for(name: str) -> None:
 def test_defaults_are_said_once(capsys: pytest.CaptureFixture[str]) -> None:
     text = " ".join(train.build_parser().format_help().split())
     assert "episodes of each evaluation (default: 20)" in text
+    assert "seed of everything random in the run (default: 0)" in text
     assert "(default: None)" not in text
     assert "(default: False)" not in text
     parser = Parser("x", {"x --y": "why"})
