@@ -173,14 +173,15 @@ def row(result: dict[str, Any], alike: Sequence[str]) -> str:
     return f"| `{name}` | {others or ''} | {' | '.join(cells)} |"
 
 
-def page(rows: Sequence[tuple[str, str]], skipped: Sequence[str]) -> str:
+def page(rows: Sequence[tuple[str, str]], skipped: Sequence[str], missing: int) -> str:
     """The table as a page.
 
     :param rows: module and line
     :param skipped: packages that are not installed
+    :param missing: families still to be tried
     """
     head = (
-        "# Goal environments of other packages\n\n"
+        "---\norphan: true\n---\n\n# Goal environments of other packages\n\n"
         "Made by `python scripts/goal_environments.py --output docs/goal_environments.md`. Each environment trained\n"
         "for 1,500 steps with tiny settings, was evaluated, filmed and exported with `--check`; or it was refused in\n"
         "one line. One id stands for its family and kind of reward; the second column counts the ids like it.\n"
@@ -192,6 +193,8 @@ def page(rows: Sequence[tuple[str, str]], skipped: Sequence[str]) -> str:
         if lines:
             table = "| id | ids like it | trains | evaluates | films | exports |\n|---|---|---|---|---|---|\n"
             parts.append(f"\n## {package} (`{module}`)\n\n{table}" + "\n".join(lines) + "\n")
+    if missing:
+        parts.append(f"\nNot tried yet: {missing} more families.\n")
     if skipped:
         parts.append(f"\nNot installed, so not tried: {', '.join(skipped)}.\n")
     return "".join(parts)
@@ -224,11 +227,10 @@ def main() -> None:
         result = run(env_id)
         rows.append((env_id.partition(":")[0], row(result, alike)))
         print(json.dumps(result), file=sys.stderr, flush=True)
-    text = page(rows, skipped)
+        if args.output is not None:  # after each, because the whole takes an hour
+            args.output.write_text(page(rows, skipped, len(chosen) - len(rows)), encoding="utf-8")
     if args.output is None:
-        print(text)
-    else:
-        args.output.write_text(text, encoding="utf-8")
+        print(page(rows, skipped, 0))
 
 
 if __name__ == "__main__":

@@ -29,12 +29,12 @@ Frame = NDArray[np.uint8]
 WIDTHS = (640, 480, 400, 320)
 
 
-def frames_of(path: Path, seed: int) -> tuple[list[Frame], float]:
+def frames_of(path: Path, seed: int, trust: bool) -> tuple[list[Frame], float]:
     """The frames of one episode and how many of them make a second."""
     info = identify(path, None)
     env = make_env(info["env_id"], **info["env_kwargs"])
     try:
-        return list(film(load_model(path), env, seed)), frames_per_second(env)
+        return list(film(load_model(path, trust=trust), env, seed)), frames_per_second(env)
     finally:
         env.close()
 
@@ -73,11 +73,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the episode (default: %(default)s)")
     parser.add_argument("--megabytes", type=float, default=3.0, help="largest size (default: %(default)s)")
     parser.add_argument("--frames", type=int, default=400, help="most frames (default: %(default)s)")
+    parser.add_argument("--trust", action="store_true", help="let the agent's file run code that it brings along")
     args = parser.parse_args()
     kind = args.output.suffix.removeprefix(".")
     if kind not in ("webp", "gif"):
         parser.error(f"--output must end in .webp or .gif, got {args.output}")
-    frames, fps = frames_of(args.model, args.seed)
+    frames, fps = frames_of(args.model, args.seed, args.trust)
     data = fitted(frames, fps, kind, int(args.megabytes * 1e6), args.frames)
     with replacing(args.output) as temporary:
         temporary.write_bytes(data)
