@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -111,7 +112,7 @@ def film(model: TBCHRL, env: gym.Env[Any, Any], trace: Trace, seed: int, size: F
     for step, unit in enumerate(trace.episode.actions):
         if step % every == 0:
             _overlay(env, trace, step, model)
-            picture: Any = env.render()
+            picture = _picture(env)
             if picture is None:
                 return None
             small = Image.fromarray(np.asarray(picture))
@@ -122,6 +123,15 @@ def film(model: TBCHRL, env: gym.Env[Any, Any], trace: Trace, seed: int, size: F
             frames.append(base64.b64encode(buffer.getvalue()).decode())
         env.step(model.policy.unit.unscale(unit))
     return {"every": every, "frames": frames, "shape": shape}
+
+
+def _picture(env: gym.Env[Any, Any]) -> Any:
+    """The task's picture; None, with a notice, where it cannot draw itself: the page does without."""
+    try:
+        return env.render()
+    except Exception as error:  # An environment's own code, or a missing OpenGL, may fail in any way.
+        print(f"film left out: {type(error).__name__}: {error}", file=sys.stderr)
+        return None
 
 
 def _overlay(env: gym.Env[Any, Any], trace: Trace, step: int, model: TBCHRL) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import gymnasium as gym
 import pytest
 import torch as th
 
@@ -15,6 +16,7 @@ from sb3_tbc.interpret import command as interpret
 from sb3_tbc.pretrained import load_pretrained, pretrained_names, pretrained_path
 from sb3_tbc.zoo.algorithms import RUN_INFO, read_zip
 from sb3_tbc.zoo.environments import make_envs
+from tests.corridor import Corridor
 
 SHORT = ["--n-episodes", "2", "--n-random", "1", "--max-alone", "2"]
 CIRCUIT = {"inter": 4, "command": 4, "motor": 1, "sensory_fanout": 3, "inter_fanout": 3, "motor_fanin": 3}
@@ -71,6 +73,25 @@ def test_memory_is_measured_where_there_is_some(
     assert plain["dynamics"] == dynamics
     assert plain["memory_share"]["share"] > 0.0
     assert [lesion["what"] for lesion in plain["lesions"]].count("memory") == 1
+
+
+def test_a_task_without_features_of_its_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One subgoal coordinate, no pictures, no names: speed, energy, distance and time are left."""
+    gym.register("InsideCorridor-v0", Corridor, disable_env_checker=True)
+    try:
+        env = make_envs("InsideCorridor-v0", 1, 0, {})
+        model = TBCHRL("MultiInputPolicy", env, compile=False, max_options=3)
+        info = {"task": "InsideCorridor-v0", "algo": "tbc-hrl", "variant": "full", "config": "custom", "seed": 0}
+        setattr(model, RUN_INFO, {**info, "env_id": "InsideCorridor-v0", "env_kwargs": {}})
+        model.save(tmp_path / "agent.zip")
+        out = {f"--{kind}": tmp_path / f"out.{kind}" for kind in ("json", "png", "html")}
+        files = [str(part) for pair in out.items() for part in pair]
+        assert interpret.main([str(tmp_path / "agent.zip"), *SHORT, *files]) == 0
+    finally:
+        del gym.registry["InsideCorridor-v0"]
+    features = json.loads(out["--json"].read_text())["correlation"]["features"]
+    assert features == ["speed", "energy", "distance to subgoal", "remaining time"]
+    assert '"live":null' in out["--html"].read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ class App {
     this.task = SIMULATED[DATA.live] || new RecordedTask(DATA);
     this.lesion = noLesion(DATA.names.length);
     Object.assign(this, { selected: null, index: 0, playing: false, whole: null });
+    this.wires = this.levels.low.wires();
     this.taskPen = new Pen($('task'));
     this.diagram = new Diagram($('lines'), $('neurons'), DATA, (unit) => this.select(unit));
     this.strips = new Strips($('strips'), DATA, (share) => this.seek(Math.floor(share * this.run.steps.length)));
@@ -114,7 +115,8 @@ class App {
     this.taskPen.clear();
     if (DATA.live) this.task.draw(this.taskPen, step.state, this.goal, step.subgoal);
     else this.task.draw(this.taskPen, step.state, this.start.goal_place, this.run, step.mark, () => { this.dirty = true; });
-    this.diagram.show(step, this.levels.low, this.ranges, this.lesion, this.selected);
+    const currents = this.levels.low.currents(this.wires, step.inputs, step.units);
+    this.diagram.show(step, this.wires, currents, this.ranges, this.lesion, this.selected);
     this.strips.show(this.run, this.index, this.selected);
     const share = Math.min(Math.max(step.left / DATA.policy.dt_max, 0), 1);
     $('budget').style.width = 100 * share + '%';
@@ -124,14 +126,14 @@ class App {
     $('slider').value = this.index;
     $('slider').setAttribute('aria-valuetext', `step ${this.index}`);
     $('step').textContent = `step ${this.index} of ${this.run.steps.length - 1}`;
-    this.drawNeuron(step);
+    this.drawNeuron(step, currents);
   }
 
-  drawNeuron(step) {
+  drawNeuron(step, currents) {
     const i = this.selected;
     if (i === null) return;
     const name = (k) => (k < 0 ? DATA.inputs[-1 - k] : DATA.names[k]);
-    const heard = this.levels.low.currents(step.inputs, step.units).filter((l) => l[1] === i);
+    const heard = this.wires.map(([from, to], k) => [from, to, currents[k]]).filter((l) => l[1] === i);
     heard.sort((a, b) => Math.abs(b[2]) - Math.abs(a[2]));
     const lines = [['potential', step.units[i].toFixed(3)], ['this episode', this.ranges[i].map((x) => x.toFixed(2)).join(' to ')]];
     if (this.levels.low.timeConstants) lines.push(['time constant', this.levels.low.timeConstants(step.inputs, step.units)[i].toFixed(3) + ' steps']);
@@ -155,6 +157,7 @@ class App {
   }
 
   clamp(unit, form) {
+    if (!DATA.live && !this.start.lesioned[unit]) return; // no episode was recorded with it
     if (!DATA.live) this.lesion = noLesion(DATA.names.length); // one recorded lesion at a time
     this.lesion.held[unit] = 1;
     this.lesion.value[unit] = DATA[form][unit];

@@ -47,31 +47,31 @@ class ConductanceCircuit {
     return { means: readOut(this, v), units: v };
   }
 
-  /** Currents through synapses at potentials v: [[from, to, current], ...]; sensory neurons are "from" -1, -2, ... */
-  currents(inputs, v) {
-    const n = this.size, { sensed, scaled, pulls } = this.drive(inputs), found = [];
-    scaled.forEach((u, i) => {
+  /** Who is wired to whom: [from, to] each; sensory neurons are "from" -1, -2, ... */
+  wires() {
+    const n = this.size, found = [], sensing = this.sensory_gain.length;
+    for (let i = 0; i < this.input_gain.length; i++) {
       for (let j = 0; j < n; j++) {
-        let current = 0, wired = false;
-        if (i < sensed.length && this.from_inputs[i][n + j] !== 0) {
-          wired = true;
-          current += sensed[i] * (this.from_inputs[i][j] - this.from_inputs[i][n + j] * v[j]);
-        }
-        if (j < this.driven && this.current_weight[i][j] !== 0) {
-          wired = true;
-          const ratio = Math.abs(pulls[j]) < 1e-6 ? 1 : Math.tanh(pulls[j]) / pulls[j];
-          current += this.from_inputs[sensed.length + j][n + j] * ratio * u * this.current_weight[i][j];
-        }
-        if (wired) found.push([-1 - i, j, current]);
-      }
-    });
-    for (let i = 0; i < this.gain.length; i++) {
-      const released = sigmoid(v[i] * this.gain[i] - this.threshold[i]), weights = this.recurrent[i];
-      for (let j = 0; j < n; j++) {
-        if (weights[n + j] !== 0) found.push([i, j, released * (weights[j] - weights[n + j] * v[j])]);
+        const senses = i < sensing && this.from_inputs[i][n + j] !== 0;
+        if (senses || (j < this.driven && this.current_weight[i][j] !== 0)) found.push([-1 - i, j]);
       }
     }
+    this.recurrent.forEach((row, i) => { for (let j = 0; j < n; j++) if (row[n + j] !== 0) found.push([i, j]); });
     return found;
+  }
+
+  /** Currents through the wires at potentials v. */
+  currents(wires, inputs, v) {
+    const n = this.size, { sensed, scaled, pulls } = this.drive(inputs), sensing = sensed.length;
+    const released = this.gain.map((g, i) => sigmoid(v[i] * g - this.threshold[i]));
+    const ratio = pulls.map((p) => (Math.abs(p) < 1e-6 ? 1 : Math.tanh(p) / p));
+    return Float64Array.from(wires, ([from, j]) => {
+      if (from >= 0) return released[from] * (this.recurrent[from][j] - this.recurrent[from][n + j] * v[j]);
+      const i = -1 - from;
+      let current = i < sensing ? sensed[i] * (this.from_inputs[i][j] - this.from_inputs[i][n + j] * v[j]) : 0;
+      if (j < this.driven) current += this.from_inputs[sensing + j][n + j] * ratio[j] * scaled[i] * this.current_weight[i][j];
+      return current;
+    });
   }
 
   /** Effective time constants at potentials v, in control steps. */
@@ -108,11 +108,16 @@ class DissipativeCircuit {
     return { means: readOut(this, x), units: x };
   }
 
-  currents(inputs, x) {
+  wires() {
     const found = [];
-    inputs.forEach((u, i) => this.input_weight[i].forEach((w, j) => { if (w !== 0) found.push([-1 - i, j, w * u]); }));
-    this.recurrent.forEach((row, i) => row.forEach((w, j) => { if (w !== 0) found.push([i, j, w * x[i]]); }));
+    this.input_weight.forEach((row, i) => row.forEach((w, j) => { if (w !== 0) found.push([-1 - i, j]); }));
+    this.recurrent.forEach((row, i) => row.forEach((w, j) => { if (w !== 0) found.push([i, j]); }));
     return found;
+  }
+
+  currents(wires, inputs, x) {
+    return Float64Array.from(wires, ([from, j]) =>
+      (from < 0 ? inputs[-1 - from] * this.input_weight[-1 - from][j] : x[from] * this.recurrent[from][j]));
   }
 }
 
@@ -137,18 +142,20 @@ class FeedForward {
     return { means: dense(x, this.weights[this.hidden.length], this.biases[this.hidden.length]), units };
   }
 
-  currents(inputs, units) {
+  wires() {
     const found = [];
-    let before = Array.from(inputs), offset = null, start = 0;
+    let offset = null, start = 0;
     this.hidden.forEach((bias, layer) => {
-      this.weights[layer].forEach((row, i) => row.forEach((w, j) => {
-        found.push([offset === null ? -1 - i : offset + i, start + j, w * before[i]]);
-      }));
-      before = Array.from(units.slice(start, start + bias.length));
+      this.weights[layer].forEach((row, i) => row.forEach((_, j) => found.push([offset === null ? -1 - i : offset + i, start + j])));
       offset = start;
       start += bias.length;
     });
+    this.strength = this.weights.slice(0, -1).flatMap((rows) => rows.flat());
     return found;
+  }
+
+  currents(wires, inputs, units) {
+    return Float64Array.from(wires, ([from], k) => this.strength[k] * (from < 0 ? inputs[-1 - from] : units[from]));
   }
 }
 

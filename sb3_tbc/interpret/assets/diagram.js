@@ -68,10 +68,10 @@ class Diagram {
   }
 
   /** Show one step; ranges are each unit's lowest and highest value of the episode. */
-  show(step, low, ranges, lesion, selected) {
+  show(step, wires, currents, ranges, lesion, selected) {
     this.layout();
     this.pen.clear();
-    this.lines(low.currents(step.inputs, step.units), selected);
+    this.lines(wires, currents, selected);
     this.nodes.forEach(({ key, shape }) => {
       const value = typeof key === 'string' ? step.action[+key.slice(1)] / this.data.policy.action_high[+key.slice(1)]
         : key < 0 ? step.inputs[-1 - key] / this.data.input_scale[-1 - key] : normalised(step.units[key], ranges[key]);
@@ -81,19 +81,19 @@ class Diagram {
     });
   }
 
-  lines(currents, selected) {
-    const c = this.pen.context, largest = Math.max(1e-9, ...currents.map((l) => Math.abs(l[2])));
-    const drawn = currents.length > MOST_LINES
-      ? currents.slice().sort((a, b) => Math.abs(b[2]) - Math.abs(a[2])).slice(0, MOST_LINES) : currents;
+  lines(wires, currents, selected) {
+    const c = this.pen.context, sizes = currents.map(Math.abs).sort(), largest = Math.max(1e-9, sizes[sizes.length - 1]);
+    const least = sizes.length > MOST_LINES ? sizes[sizes.length - MOST_LINES] : 0;
     const reads = [];
     this.data.readout.forEach((row, i) => row.forEach((w, a) => { if (w !== 0) reads.push([i, 'a' + a, w]); }));
     const strongest = Math.max(1e-9, ...reads.map((l) => Math.abs(l[2])));
     c.strokeStyle = theme('muted');
     for (const [from, to, w] of reads.length > MOST_LINES ? [] : reads) this.stroke(from, to, 0.3 * Math.abs(w) / strongest, w < 0, selected);
     c.strokeStyle = theme('ink');
-    for (const [from, to, current] of drawn) {
-      this.stroke(from, to, Math.abs(current) / largest, current < 0, selected);
-    }
+    wires.forEach(([from, to], k) => {
+      const size = Math.abs(currents[k]);
+      if (size >= least) this.stroke(from, to, size / largest, currents[k] < 0, selected);
+    });
     c.setLineDash([]);
     c.globalAlpha = 1;
   }
