@@ -8,6 +8,7 @@ remembers. A new setting is one field here and the code that uses it. Settings o
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal, Self
 
@@ -177,6 +178,16 @@ class TBCConfig(AgentConfig):
                 f"{self.low.goal_strategy!r} has an effect with low_reward='step' alone, here it is "
                 f"{self.low_reward!r}: hindsight subgoals that depend on time come from the same window",
             )
+
+    def warn_before_learning(self) -> None:
+        """Say so where a replay buffer holds less than a batch: its level would never be updated."""
+        for name, level in (("high", self.high), ("low", self.low)):
+            if level.buffer_size < level.batch_size:
+                warnings.warn(
+                    f"the {name} level is never updated: {name}.buffer_size={level.buffer_size} holds less than a "
+                    f"batch of {name}.batch_size={level.batch_size}",
+                    stacklevel=3,
+                )
 
     @property
     def failed_test_reward(self) -> float:

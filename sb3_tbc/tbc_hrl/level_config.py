@@ -24,6 +24,9 @@ Neurons = Annotated[int, Range(1, 1024)]
 Fan = Annotated[int, Range(1, 4096)]
 Width = Annotated[int, Range(1, 16384)]
 
+MOST_SUB_STEPS = 64
+"""Sub-steps of a control step beyond which nothing is gained and much time is lost."""
+
 
 def learning_rate_of(value: float | str) -> float | LinearSchedule:
     """A constant learning rate, or ``"lin_<rate>"``: one that falls linearly to zero at the end of training."""
@@ -109,7 +112,7 @@ class CircuitConfig(Settings):
     """Command neurons that each motor neuron listens to."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Seed of the wiring."""
-    sub_steps: Annotated[int, Range(1, 64)] = 3
+    sub_steps: Annotated[int, Range(1, MOST_SUB_STEPS)] = 3
     """Sub-steps of each control step, K; three synapses lie between sensory and motor neurons."""
     dynamics: Literal["conductance", "dissipative"] = "conductance"
     """Neuron model: membrane potentials with conductances, or the dissipative cell of equations 20 and 21."""
@@ -136,6 +139,12 @@ class CircuitConfig(Settings):
         if self.sensory_to != ("inter", "command", "motor")[: len(self.sensory_to)] or not self.sensory_to:
             raise SettingError(
                 "sensory_to", f"must name layers in order, beginning with 'inter', got {list(self.sensory_to)}"
+            )
+        if isinstance(self.adaptive_step, StepRule) and self.adaptive_step.max_sub_steps > MOST_SUB_STEPS:
+            raise SettingError(
+                "adaptive_step.delta_min",
+                f"must be at least 1 / {MOST_SUB_STEPS}, its inverse is the most sub-steps there are; got "
+                f"{self.adaptive_step.delta_min:g}",
             )
         if self.synapses == "lean" and self.dynamics != "conductance":
             raise SettingError("synapses", f"'lean' needs dynamics='conductance', got dynamics={self.dynamics!r}")

@@ -234,6 +234,7 @@ class TBCHRL(PlainAlgorithm):
         :raises TypeError: if ``total_timesteps`` is not a whole number
         """
         self._refuse_foreign_high("learn")
+        self.config.warn_before_learning()
         total_timesteps = whole_steps(total_timesteps)
         if self.env is None:
             raise ValueError("learn needs an environment: pass env to load, or call set_env first")

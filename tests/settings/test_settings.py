@@ -151,7 +151,7 @@ NONSENSE: dict[str, list[Any]] = {
     "low.policy_kwargs.ndbc.dynamics": ["euler"],
     "low.policy_kwargs.ndbc.readout": ["none"],
     "low.policy_kwargs.ndbc.max_rho": [0.9, 2],
-    "low.policy_kwargs.ndbc.adaptive_step": [{"etta": 1}, {"delta_min": 0.5, "delta_max": 0.1}, 3],
+    "low.policy_kwargs.ndbc.adaptive_step": [{"etta": 1}, {"delta_min": 0.5, "delta_max": 0.1}, {"delta_min": 1e-9}, 3],
     "low.policy_kwargs.ndbc.sensory_to": [["motor"], []],
     "low": [[1], 3, "fast"],
     "max_options": [0, -1, 2.5, "ten", True],
@@ -194,6 +194,39 @@ def test_nonsense_is_one_clear_error(name: str, value: Any) -> None:
     first, *others = str(told.value).splitlines()
     assert not others
     assert name.split(".")[-1] in first
+
+
+@pytest.mark.parametrize(("name", "value"), [(n, v) for n, vs in NONSENSE.items() for v in vs if not callable(v)])
+def test_nonsense_in_a_file_or_command_is_told_before_anything_is_written(name: str, value: Any) -> None:
+    def read_and_build() -> None:
+        model = load_config("tbc-hrl", "Other-v0", overrides=nested(name, value)).model
+        TBCConfig.from_dict({key: value for key, value in model.items() if key != "policy"})
+
+    with pytest.raises(ConfigError):
+        read_and_build()
+
+
+@pytest.mark.parametrize(
+    ("item", "message"),
+    [
+        ("n_envs:1e9", "n_envs must be a whole number from 1 to 4,096, got 1000000000.0"),
+        ("n_timesteps:-5", "n_timesteps must be a whole number from 1"),
+        ("env_kwargs:3", "env_kwargs must be a section"),
+        ("policy:MlpPolicy", "policy must be 'MultiInputPolicy', got 'MlpPolicy'"),
+        ("low:{policy_kwargs: {net_arch: {pi: [4], vf: [4]}}}", "unknown setting 'low.policy_kwargs.net_arch.vf'"),
+        ("gradient_ratio:1e300", "gradient_ratio must be a number from 0 to 1,000"),
+    ],
+)
+def test_keys_of_the_runner(item: str, message: str) -> None:
+    with pytest.raises(ConfigError) as told:
+        parse_overrides([item])
+    assert message in str(told.value)
+
+
+def test_a_replay_buffer_below_one_batch_is_told_before_learning() -> None:
+    model = TBCHRL("MultiInputPolicy", Corridor(), compile=False, low={"buffer_size": 100, "batch_size": 128})
+    with pytest.warns(UserWarning, match=r"the low level is never updated: low\.buffer_size=100 holds"):
+        model.learn(10)
 
 
 @pytest.mark.parametrize("name", ["gamma", "tau", "batch_size", "buffer_size", "learning_rate", "policy_kwargs"])
