@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_tbc.errors import FolderInUseError, WriteError
+from sb3_tbc.errors import ConfigError, FolderInUseError, WriteError
 
 try:
     import fcntl
@@ -46,7 +46,7 @@ def explained(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except WriteError:
+    except (WriteError, ConfigError):
         raise
     except Exception as error:
         failure = _system_error(error)

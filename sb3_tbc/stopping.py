@@ -6,7 +6,7 @@ import contextlib
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
@@ -18,6 +18,13 @@ class StopRequest:
 
     def __init__(self) -> None:
         self.signal: str | None = None
+        self._tell: Callable[[], None] | None = None
+
+    def calls(self, tell: Callable[[], None]) -> None:
+        """Call something when a stop is asked for, or now if it was already: it may only set a flag."""
+        self._tell = tell
+        if self:
+            tell()
 
     def __bool__(self) -> bool:
         return self.signal is not None
@@ -25,6 +32,8 @@ class StopRequest:
     def ask(self, number: int, frame: FrameType | None = None) -> None:
         """Take note of a signal; a further one changes nothing, so that an impatient second Ctrl-C loses nothing."""
         again, self.signal = self.signal is not None, signal.Signals(number).name
+        if self._tell is not None:
+            self._tell()
         with contextlib.suppress(OSError, ValueError, RuntimeError):  # the terminal may be gone, or writing already
             print(
                 f"\n{self.signal}: stopping already; `kill -9` ends it without saving"

@@ -57,7 +57,7 @@ def test_a_run_leaves_everything_behind(run: RunFolder) -> None:
     assert [row.timesteps for row in run.read_evaluations()] == [200, 400]
     assert run.read_config()["model"]["low"]["batch_size"] == 16
     assert (run.path / "command.txt").read_text().startswith("python -m sb3_tbc.train --env Pendulum")
-    assert (run.path / "options.csv").read_text().count("\n") > 3
+    assert (run.path / "options.csv").read_text().count("\n") > 1
     assert sum(option["duration"] for option in last_episode(run.path / "options.csv")) > 1
 
 

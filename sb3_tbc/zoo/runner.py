@@ -327,9 +327,12 @@ class Training:
         ]
         left, fresh = wanted - self.model.num_timesteps, self.model.num_timesteps == 0
         try:
+            options.stop.calls(lambda: setattr(self.model, "stop_requested", True))
             self.model.learn(
                 left, callback=CallbackList(callbacks), reset_num_timesteps=fresh, progress_bar=options.progress
             )
+            if options.stop and self.model.num_timesteps < wanted:
+                raise StopTraining
         except StopTraining as stop:
             if options.save_at_end:
                 self.checkpoint()

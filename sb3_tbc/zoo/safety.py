@@ -82,13 +82,14 @@ class ConsistentState(BaseCallback):
     """
 
     ATTRIBUTES = (
-        *("num_timesteps", "_episode_num", "_current_progress_remaining", "_n_updates", "_updated_at"),
+        *("num_timesteps", "_episode_num", "_current_progress_remaining", "_n_updates", "_updated_at", "_burst_due"),
         *("ep_info_buffer", "ep_success_buffer"),
     )
 
     def __init__(self) -> None:
         super().__init__()
         self._attributes: dict[str, Any] = {}
+        self._stored: tuple[int, ...] = ()
         self._arrays: dict[str, NDArray[Any]] = {}
 
     def _on_step(self) -> bool:
@@ -97,15 +98,21 @@ class ConsistentState(BaseCallback):
     def _on_rollout_start(self) -> None:
         if isinstance(self.model, TBCHRL):
             self._arrays = {name: np.array(array) for name, array in self.model.learning_state().items()}
+            self._stored = self._rows(self.model)
             self._attributes = {n: deepcopy(getattr(self.model, n)) for n in self.ATTRIBUTES if hasattr(self.model, n)}
 
     def _on_rollout_end(self) -> None:
         self._arrays, self._attributes = {}, {}
 
+    @staticmethod
+    def _rows(model: TBCHRL) -> tuple[int, ...]:
+        """How much replay there is: an episode may be stored already when a callback fails."""
+        return tuple(place for buffer in model.replay_buffer for place in (buffer.size(), buffer.pos))
+
     def go_back(self) -> Callable[[Path], None] | None:
         """Take the agent back to that point, and return what writes its replay; None if there is no such point."""
         model = self.model
-        if not self._attributes or not isinstance(model, TBCHRL):
+        if not self._attributes or not isinstance(model, TBCHRL) or self._rows(model) != self._stored:
             return None
         vars(model).update(self._attributes)
         arrays = self._arrays

@@ -164,7 +164,7 @@ def contents(folder: Path) -> dict[str, Any]:
                 recorded = (
                     ".recorder." in name and arrays[name].ndim > 1
                 )  # what lies behind the steps done is left over
-                array = arrays[name][:, : max(done) + 1] if recorded else arrays[name]
+                array = arrays[name][:, : max(done)] if recorded else arrays[name]
                 found[f"replay:{name}"] = array.tobytes()
     with (folder / "evaluations.csv").open() as file:
         found["evaluations"] = [{k: v for k, v in row.items() if k != "wall_time"} for row in csv.DictReader(file)]
