@@ -7,6 +7,7 @@ itself truncates the step that ends it.
 
 from __future__ import annotations
 
+import inspect
 import time
 from typing import Any, NamedTuple
 
@@ -129,7 +130,18 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return {key: np.asarray(observation[key], dtype=self._parts[key].dtype) for key in GOAL_KEYS}
 
 
-class LimitingVecEnv(VecEnvWrapper):
+class CopyableVecEnvWrapper(VecEnvWrapper):
+    """A wrapper that can be copied and pickled: SB3's holds all that its class inherits, much of which cannot be."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All but what the class itself tells."""
+        return {name: value for name, value in self.__dict__.items() if name != "class_attributes"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, class_attributes=dict(inspect.getmembers(type(self))))
+
+
+class LimitingVecEnv(CopyableVecEnvWrapper):
     """The same for environments that cannot be reached, such as those of other processes.
 
     Whatever is wrapped around this vector sees the end of the episode; a ``Monitor`` in another process does not.

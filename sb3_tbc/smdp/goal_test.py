@@ -97,6 +97,10 @@ class EpisodeJudge:
         self._venv = venv
         self._warned = False
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies, which ask their own environments."""
+        return {name: value for name, value in self.__dict__.items() if name != "goal_test"}
+
     @cached_property
     def goal_test(self) -> GoalTest:
         """The task's own reward and end for any goals."""

@@ -9,12 +9,19 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.errors import HierarchyError
-from sb3_tbc.smdp.episode_limit import ANNOUNCE, BUDGET_EXHAUSTED, LastWindow, can_tell, with_episode_limit
+from sb3_tbc.smdp.episode_limit import (
+    ANNOUNCE,
+    BUDGET_EXHAUSTED,
+    CopyableVecEnvWrapper,
+    LastWindow,
+    can_tell,
+    with_episode_limit,
+)
 from sb3_tbc.smdp.faults import step_or_name
 from sb3_tbc.smdp.finite import all_finite, refusal
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, width
@@ -53,7 +60,7 @@ class HierarchicalStep(NamedTuple):
     episodes: dict[int, Episode]  # those that ended, by environment
 
 
-class HierarchicalVecEnv(VecEnvWrapper):
+class HierarchicalVecEnv(CopyableVecEnvWrapper):
     """Runs timed windows over a vector of goal environments and shows the low level's problem.
 
     An observation is ``(local state, subgoal, remaining time)``, a reward is 1 when a window ends with its subgoal

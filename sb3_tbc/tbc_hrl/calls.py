@@ -31,3 +31,19 @@ def refuse_vec_normalize(env: VecEnv) -> None:
         raise ValueError(
             "VecNormalize moves the subgoal space while the agent learns; use the task's fixed scales instead"
         )
+
+
+OF_A_LEVEL = ("gamma", "tau", "batch_size", "buffer_size", "ent_coef", "target_entropy", "learning_rate")
+"""What SB3's agents of one level let users change between two calls of ``learn``."""
+
+
+def refuse_level_setting(name: str, value: Any) -> None:
+    """Refuse to set on the agent what its levels would never read.
+
+    :raises AttributeError: naming what to do instead
+    """
+    if name in OF_A_LEVEL and (name != "learning_rate" or value != 0.0):  # SB3 sets that one itself
+        raise AttributeError(
+            f"{name} belongs to a level, and there are two: load the saved agent with other settings, "
+            f"load(path, env, low={{{name!r}: {value!r}}}) or high={{...}}"
+        )

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.utils import safe_mean
 
 from sb3_tbc.smdp.hindsight import HighLevelSteps
 from sb3_tbc.smdp.options import Episode
@@ -40,6 +43,22 @@ class EpisodeDiagnostics:
         means = {name: float(np.mean(values)) for name, values in self.values.items()}
         self.values.clear()
         return means
+
+
+def record_progress(model: BaseAlgorithm) -> None:
+    """Log what SB3's algorithms log of the time that passed and of the episodes that ended."""
+    logger = model.logger
+    elapsed = max((time.time_ns() - model.start_time) / 1e9, 1e-9)
+    logger.record("time/episodes", model._episode_num, exclude="tensorboard")
+    logger.record("time/fps", int((model.num_timesteps - model._num_timesteps_at_start) / elapsed))
+    logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
+    logger.record("time/total_timesteps", model.num_timesteps, exclude="tensorboard")
+    if model.ep_info_buffer:
+        logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in model.ep_info_buffer]))
+        logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in model.ep_info_buffer]))
+    if model.ep_success_buffer:
+        logger.record("rollout/success_rate", safe_mean(model.ep_success_buffer))
+    logger.record("train/n_updates", model._n_updates)
 
 
 def progress_bar_of(callback: BaseCallback) -> Any | None:

@@ -56,6 +56,13 @@ def generators(learning: LearningState) -> dict[str, np.random.Generator]:
     return found
 
 
+def reseed(learning: LearningState, seed: int) -> None:
+    """Let every source of randomness begin anew."""
+    found = generators(learning)
+    for generator, part in zip(found.values(), np.random.SeedSequence(seed).spawn(len(found)), strict=True):
+        generator.bit_generator.state = np.random.default_rng(part).bit_generator.state
+
+
 def get_state(learning: LearningState) -> Arrays:
     """Random streams, counters, live options and running episodes, as plain arrays.
 

@@ -15,7 +15,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import safe_mean
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.replay.both_levels import Replay
@@ -32,10 +31,10 @@ from sb3_tbc.tbc_hrl import assembly, resume
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
-from sb3_tbc.tbc_hrl.calls import refuse_vec_normalize, whole_steps
+from sb3_tbc.tbc_hrl.calls import refuse_level_setting, refuse_vec_normalize, whole_steps
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
-from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of
+from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of, record_progress
 from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, mismatch_explained, reward_range
 from sb3_tbc.tbc_hrl.foreign_high import put_together
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
@@ -127,6 +126,11 @@ class TBCHRL(PlainAlgorithm):
                 return getattr(self.config, name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
+        def __setattr__(self, name: str, value: Any) -> None:
+            """Refuse what changes nothing: settings of a level, as SB3's agents of one level have them."""
+            refuse_level_setting(name, value)
+            super().__setattr__(name, value)
+
     # ------------------------------------------------------------------ set-up
 
     def _setup_model(self) -> None:
@@ -157,22 +161,33 @@ class TBCHRL(PlainAlgorithm):
         self.low = assembly.make_low_level(config, low_spaces, seeds[2], self.device, low_bounds, self.layout)
         self.reachability = assembly.make_reachability(config, subgoals, self.rules, seeds[6])
         self.schedule = assembly.make_schedule(config, self.layout, self.rules, self.reachability)
+        self._make_replay(high_spaces, low_spaces, seeds[3], seeds[4])
+        self.policy = TBCPolicy(
+            space, actions, self.high, self.low, self.layout, self.rules, config.memory, seeds[5], self.schedule
+        )
+        self.diagnostics = EpisodeDiagnostics()
+
+    def _make_replay(self, high_spaces: LevelSpaces, low_spaces: LevelSpaces, high_seed: int, low_seed: int) -> None:
+        """Empty replay buffers for both levels, and what fills them."""
+        config = self.config
         self.replay_buffer = Replay(
-            assembly.make_high_buffer(config, high_spaces, seeds[3], self.device, self.high, self.layout, self.rules,
+            assembly.make_high_buffer(config, high_spaces, high_seed, self.device, self.high, self.layout, self.rules,
                                       self.reachability),
-            assembly.make_low_buffer(config, low_spaces, seeds[4], self.device, self.low, self.layout,
+            assembly.make_low_buffer(config, low_spaces, low_seed, self.device, self.low, self.layout,
                                      self.low_level_reward),
         )  # fmt: skip
         self.high.attach(self.replay_buffer.high)
         self.low.attach(self.replay_buffer.low)
-        self.policy = TBCPolicy(
-            space, actions, self.high, self.low, self.layout, self.rules, config.memory, seeds[5], self.schedule
-        )
         self.store = EpisodeStore(
             self.replay_buffer, self.layout, self.rules, self.high_reward, self.low_level_reward,
             assembly.hindsight_settings(config), self.rng,
         )  # fmt: skip
-        self.diagnostics = EpisodeDiagnostics()
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Draw everything that comes from the beginning of these random streams, see SB3."""
+        super().set_random_seed(seed)
+        if seed is not None and "diagnostics" in self.__dict__:  # all parts are there
+            resume.reseed(self._moving_parts(), seed)
 
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""
@@ -366,19 +381,9 @@ class TBCHRL(PlainAlgorithm):
 
     def dump_logs(self) -> None:
         """Write what was seen since the last time: SB3's keys, and per level what explains learning."""
-        elapsed = max((time.time_ns() - self.start_time) / 1e9, 1e-9)
-        self.logger.record("time/episodes", self._episode_num, exclude="tensorboard")
-        self.logger.record("time/fps", int((self.num_timesteps - self._num_timesteps_at_start) / elapsed))
-        self.logger.record("time/time_elapsed", int(elapsed), exclude="tensorboard")
-        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
-        if self.ep_info_buffer:
-            self.logger.record("rollout/ep_rew_mean", safe_mean([info["r"] for info in self.ep_info_buffer]))
-            self.logger.record("rollout/ep_len_mean", safe_mean([info["l"] for info in self.ep_info_buffer]))
-        if self.ep_success_buffer:
-            self.logger.record("rollout/success_rate", safe_mean(self.ep_success_buffer))
+        record_progress(self)
         for name, value in self.diagnostics.drain().items():
             self.logger.record(name, value)
-        self.logger.record("train/n_updates", self._n_updates)
         self.logger.dump(step=self.num_timesteps)
 
     # ------------------------------------------------------------------ saving
@@ -469,4 +474,8 @@ class TBCHRL(PlainAlgorithm):
         :param truncate_last_traj: for SB3's sake; unfinished episodes are never in the buffers
         :raises ValueError: if the file was written for other spaces or sizes
         """
+        if getattr(self, "replay_buffer", None) is None:
+            levels: Any = (self.high, self.low)
+            high, low = (LevelSpaces(level.observation_space, level.action_space) for level in levels)
+            self._make_replay(high, low, *self.rng.integers(2**31, size=2).tolist())
         self._resumed = self.replay_buffer.load(path)
