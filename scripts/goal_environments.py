@@ -165,7 +165,8 @@ def row(result: dict[str, Any], alike: Sequence[str]) -> str:
     stages = [result.get(stage, "-") for stage in ("training", "evaluating", "filming", "exporting")]
     if stages[0] not in ("yes", "-"):
         said = stages[0].partition("cannot be used as a goal environment: ")[2] or stages[0]
-        cells = [f"refused: {said.replace('|', '/')}", "", "", ""]
+        broken = said.startswith(("TRACEBACK", "DIED", "TIMEOUT"))
+        cells = [("" if broken else "refused: ") + said.replace("|", "/"), "", "", ""]
     else:
         cells = [stage if stage == "yes" else f"no: {stage}" for stage in stages]
         if result.get("difference"):
