@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_tbc.commands import Parser, positive_int, run_command
+from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.zoo.config import CONFIGS
@@ -64,6 +64,7 @@ def _add_fit(commands: Any) -> None:
     record.add_argument("--out", metavar="OUT.npz", help="by default the task's file among the package's skills")
     record.add_argument("--every", type=positive_int, default=3, help="take every so many steps")
     record.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    add_trust(record)
 
 
 def _add_train(commands: Any) -> None:
@@ -116,7 +117,8 @@ def _measure(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
 def _record(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
     from sb3_tbc.benchmark.skills import record_file
 
-    written = record_file(Path(arguments.model), Path(arguments.out) if arguments.out else None, arguments.every)
+    out = Path(arguments.out) if arguments.out else None
+    written = record_file(Path(arguments.model), out, arguments.every, arguments.trust)
     return [f"recording      {written} ({written.stat().st_size / 1e6:.2f} MB)"], {"recording": str(written)}
 
 

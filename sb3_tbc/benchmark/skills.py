@@ -123,12 +123,13 @@ def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[st
     return {**half, "learnt": np.array(learnt)}
 
 
-def record_file(path: Path, out: Path | None, every: int) -> Path:
+def record_file(path: Path, out: Path | None, every: int, trust: bool = False) -> Path:
     """Record the agent in a ``.zip`` on the task it was trained on.
 
     :param path: the agent
     :param out: where to write; by default where the skills of this package lie, under the task's name
     :param every: see :func:`record`
+    :param trust: whether the file may run code that it brings along
     :return: the file written
     :raises ConfigError: if the agent does not say what it was trained on
     """
@@ -136,7 +137,7 @@ def record_file(path: Path, out: Path | None, every: int) -> Path:
     if info is None:
         raise ConfigError(f"{path} does not say which environment it was trained on; train with sb3_tbc.train")
     env = make_envs(info["env_id"], 1, 0, info["env_kwargs"])
-    recording = record(load_two_levels(path), env, every)
+    recording = record(load_two_levels(path, trust=trust), env, every)
     env.close()
     task, _ = resolve_env(info["env_id"])
     out = out or Path(str(files("sb3_tbc.benchmark") / "skills")) / f"{task}.npz"

@@ -25,6 +25,7 @@ from sb3_tbc.benchmark.floor import gemm_rate, products
 from sb3_tbc.benchmark.profile import OUTSIDE, PARTS, profile
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.level.compilation import compiler_problem
+from sb3_tbc.ndbc.network import SYNAPSES
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import RunConfig, load_config
@@ -211,29 +212,30 @@ def floor(task: str, steps: int, rounds: int, config: str | None = None) -> Resu
 
 
 def update(rounds: int, batch_size: int = 256, burst: int = 64) -> Result:
-    """One low-level update with a circuit, K = 3, beside an update of SB3's SAC with the same critics."""
+    """One low-level update with a circuit, K = 3, both kinds of synapses, beside SB3's SAC with the same critics."""
     from stable_baselines3 import SAC
 
     from sb3_tbc.benchmark.cells import in_turns
 
-    circuit = ours("Pendulum", low={"batch_size": batch_size, "policy_kwargs": {
+    circuits = {synapses: ours("Pendulum", low={"batch_size": batch_size, "policy_kwargs": {
         "net_arch": [32, 32], "mean_bound": 3.0, "ndbc": {"inter": 6, "command": 6, "motor": 1, "sensory_fanout": 3,
-        "inter_fanout": 4, "recurrent_command_synapses": 1, "motor_fanin": 4, "sub_steps": 3}}})  # fmt: skip
-    circuit.learn(600)
-    sac = SAC("MlpPolicy", _level_env(circuit), policy_kwargs={"net_arch": [32, 32]}, batch_size=batch_size,
+        "inter_fanout": 4, "recurrent_command_synapses": 1, "motor_fanin": 4, "sub_steps": 3, "synapses": synapses}}})
+        for synapses in SYNAPSES}  # fmt: skip
+    for circuit in circuits.values():
+        circuit.learn(600)
+    sac = SAC("MlpPolicy", _level_env(circuits["paper"]), policy_kwargs={"net_arch": [32, 32]}, batch_size=batch_size,
               learning_starts=10**9, seed=0).learn(600)  # fmt: skip
     jobs = {
-        "TBC-HRL, low level, NDBC K=3": lambda: circuit.low.train(burst, batch_size),
+        "TBC-HRL, low level, NDBC K=3": lambda: circuits["paper"].low.train(burst, batch_size),
+        "the same, lean synapses": lambda: circuits["lean"].low.train(burst, batch_size),
         "SB3 SAC, MLP": lambda: sac.train(burst, batch_size),
     }
     seconds = in_turns(jobs, rounds)
     rows = {name: 1e3 * statistics.median(values) / burst for name, values in seconds.items()}
-    (name, mine), (other, theirs) = rows.items()
-    lines = [
-        f"| one update, batch {batch_size}, critics 32x32 | ms |", "|---|---|",
-        f"| {name} | {mine:.3f} |", f"| {other} | {theirs:.3f} |", f"| ratio | {theirs / mine:.2f} |",
-    ]  # fmt: skip
-    return lines, {"ms": rows, "ratio": theirs / mine}
+    mine, *_, theirs = rows.values()
+    lines = [f"| one update, batch {batch_size}, critics 32x32 | ms |", "|---|---|"]
+    lines += [f"| {name} | {milliseconds:.3f} |" for name, milliseconds in rows.items()]
+    return [*lines, f"| ratio | {theirs / mine:.2f} |"], {"ms": rows, "ratio": theirs / mine}
 
 
 class _SpacesEnv(gym.Env[Any, Any]):
