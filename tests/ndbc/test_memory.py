@@ -114,3 +114,11 @@ def delay_error(seed: int, **kwargs: object) -> tuple[int, float]:
     with th.no_grad():
         error = (net(skill.later_inputs)[0] - skill.later_targets).square().mean()
     return sum(p.numel() for p in net.parameters()), float(error)
+
+
+@pytest.mark.slow
+def test_slow_neurons_learn_a_delay_that_fast_ones_cannot() -> None:
+    parameters, slow = delay_error(0, time_constants={"command": (0.5, 3.0)}, initial_gains=(6.0, 12.0))
+    assert parameters <= 235
+    assert slow < 0.04  # measured: .023 to .029; the variance is .27
+    assert delay_error(0)[1] > 0.2
