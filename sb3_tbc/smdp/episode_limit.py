@@ -112,6 +112,12 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, reward, terminated, truncated, info
 
     def _check(self, observation: Any, info: Any) -> None:
+        if isinstance(info, dict) and isinstance(observation, dict):
+            for key, shape in self._shapes:
+                if getattr(observation.get(key), "shape", None) != shape:
+                    break
+            else:
+                return
         for key, shape in self._shapes:
             part = observation.get(key) if isinstance(observation, dict) else None
             if part is None or np.shape(part) != shape:

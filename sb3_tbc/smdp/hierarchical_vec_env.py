@@ -220,6 +220,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         where wrappers change what it sees, it may be a step late, which the window then lasts longer.
         """
         over = self.clock.ended(seen) | dones
+        if not np.count_nonzero(over):
+            return over
         late = over & ~dones & (self.clock.used >= self.rules.max_options)
         if np.count_nonzero(late):
             for index in np.flatnonzero(late):
