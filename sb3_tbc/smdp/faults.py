@@ -43,12 +43,15 @@ def step_or_name(venv: VecEnv, actions: NDArray[Any], steps: NDArray[Any]) -> Ve
 
 def _wait(workers: SubprocVecEnv, steps: NDArray[Any]) -> None:
     until = time.monotonic() + STEP_TIMEOUT
-    for index, remote in enumerate(workers.remotes):
-        if not remote.poll(max(until - time.monotonic(), 0.0)):
-            raise EnvironmentFault(
-                f"environment {index} hangs at step {steps[index] + 1} of its episode: its process gave no answer for "
-                f"{STEP_TIMEOUT:.0f} s"
-            )
+    for index, (remote, process) in enumerate(zip(workers.remotes, workers.processes, strict=True)):
+        while not remote.poll(min(max(until - time.monotonic(), 0.0), 0.5)):
+            if not process.is_alive():  # its end of the pipe may live on in processes that were forked later
+                raise EOFError
+            if time.monotonic() >= until:
+                raise EnvironmentFault(
+                    f"environment {index} hangs at step {steps[index] + 1} of its episode: its process gave no answer "
+                    f"for {STEP_TIMEOUT:.0f} s"
+                )
 
 
 def _dead(workers: SubprocVecEnv, steps: NDArray[Any]) -> str:
