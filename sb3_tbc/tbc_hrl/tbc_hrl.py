@@ -6,7 +6,6 @@ import io
 import pathlib
 import time
 from collections.abc import Iterable, Mapping
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -38,6 +37,8 @@ from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_
 from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, mismatch_explained, reward_range
 from sb3_tbc.tbc_hrl.foreign_high import put_together
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
+from sb3_tbc.tbc_hrl.level_config import learning_rate_of
+from sb3_tbc.tbc_hrl.live_settings import LiveSettings
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
@@ -104,14 +105,28 @@ class TBCHRL(PlainAlgorithm):
             self._setup_model()
 
     @property
-    def high_settings(self) -> Mapping[str, Any]:
-        """Settings of the high level, to be read: they are chosen when the agent is made or loaded."""
-        return MappingProxyType(self.config.high.to_dict())
+    def high_settings(self) -> LiveSettings:
+        """Settings of the high level; those in :data:`.CHANGEABLE` may be set, and hold from the next update on."""
+        return self._live_settings("high")
 
     @property
-    def low_settings(self) -> Mapping[str, Any]:
-        """Settings of the low level, to be read."""
-        return MappingProxyType(self.config.low.to_dict())
+    def low_settings(self) -> LiveSettings:
+        """Settings of the low level, likewise."""
+        return self._live_settings("low")
+
+    def _live_settings(self, name: str) -> LiveSettings:
+        return LiveSettings(name, self.settings[name], lambda key, value: self._change_setting(name, key, value))
+
+    def _change_setting(self, name: str, key: str, value: Any) -> None:
+        settings = {**self.settings, name: {**self.settings[name], key: value}}
+        self.config = self.config_class.from_dict(settings)
+        self.settings = self.config.to_dict()
+        level = self.high if name == "high" else self.low
+        if key == "learning_rate":
+            level.learning_rate = learning_rate_of(value)
+            level._setup_lr_schedule()
+        elif key == "tau":
+            level.tau = value
 
     @property
     def dt_max(self) -> float:

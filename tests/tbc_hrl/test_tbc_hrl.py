@@ -338,8 +338,13 @@ def test_load_changes_settings_or_refuses(tmp_path: Path) -> None:
     for change in ({"learning_rate": 0.5}, {"gamma": 0.5}, {"custom_objects": {"learning_rate": 0.5}}):
         with pytest.raises(ValueError, match="use low="):
             TBCHRL.load(tmp_path / "model", **change)
-    with pytest.raises(TypeError):
-        loaded.low_settings["learning_rate"] = 1e-3  # type: ignore[index]
+    loaded.low_settings["learning_rate"] = 1e-3
+    assert (loaded.low.lr_schedule(1.0), loaded.config.low.learning_rate) == (1e-3, 1e-3)
+    assert loaded.settings["low"]["learning_rate"] == 1e-3
+    with pytest.raises(ValueError, match=r"low\.gamma is chosen when the agent is made or loaded"):
+        loaded.low_settings["gamma"] = 0.5
+    with pytest.raises(ValueError, match=r"low\.tau must be a number above 0"):
+        loaded.low_settings["tau"] = 2
 
 
 def test_a_level_may_have_a_gradient_ratio_of_its_own() -> None:

@@ -1,0 +1,48 @@
+"""Settings of a level as a mapping in which those that can change while an agent learns may be set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from sb3_tbc.settings import SettingError
+
+CHANGEABLE = ("learning_rate", "batch_size", "gradient_ratio", "tau")
+"""Settings that take effect with the next update; all others are built into the level."""
+
+
+class LiveSettings(Mapping[str, Any]):
+    """A level's settings; ``settings["learning_rate"] = 1e-4`` holds from the next update on.
+
+    :param name: the level, ``"high"`` or ``"low"``
+    :param values: its settings
+    :param change: takes a setting's name and new value
+    """
+
+    def __init__(self, name: str, values: Mapping[str, Any], change: Callable[[str, Any], None]) -> None:
+        self._name, self._values, self._change = name, values, change
+
+    def __getitem__(self, key: str) -> Any:
+        return self._values[key]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+    def __setitem__(self, key: str, value: Any) -> None:
+        """Change a setting of the agent.
+
+        :raises SettingError: if it is none that can change, or the value is not allowed
+        """
+        if key not in CHANGEABLE:
+            raise SettingError(
+                f"{self._name}.{key}",
+                f"is chosen when the agent is made or loaded: load(path, {self._name}={{{key!r}: ...}}) changes it; "
+                f"later only {', '.join(CHANGEABLE)} can",
+            )
+        self._change(key, value)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self._values!r})"
