@@ -199,7 +199,7 @@ def test_faults_of_a_task_name_environment_and_step() -> None:
         "info": (ValueError, "environment 1, step 2 .* info must be a dictionary, got None"),
     }
     for fault, (error, message) in cases.items():
-        venv = DummyVecEnv([Corridor, Faulty])
+        venv = DummyVecEnv([lambda: Corridor(30, 5.0), lambda: Faulty(30, 5.0)])
         venv.envs[1].fault = fault
         env = hierarchical(venv)
         env.reset()
