@@ -8,6 +8,7 @@ from inspect import signature
 from typing import Any
 
 import gymnasium
+from gymnasium.envs.registration import WrapperSpec
 
 _CLASSES = {  # module, time limit
     "Pendulum": ("pendulum", 1000),
@@ -49,7 +50,7 @@ def register_tasks() -> None:
     """Register every task with Gymnasium; calling it again changes nothing.
 
     Of the wrappers that ``gymnasium.make`` adds, only the ``TimeLimit`` is kept: the tasks themselves check actions and
-    the order of calls.
+    the order of calls. Around it :class:`~sb3_tbc.tasks.goal_access.GoalAccess` shows the task's own attributes.
     """
     for task, (_, max_episode_steps) in _CLASSES.items():
         task_id = f"sb3_tbc/{task}-v0"
@@ -61,4 +62,5 @@ def register_tasks() -> None:
                 max_episode_steps=max_episode_steps,
                 order_enforce=False,
                 disable_env_checker=True,
+                additional_wrappers=(WrapperSpec("GoalAccess", "sb3_tbc.tasks.goal_access:GoalAccess", {}),),
             )
