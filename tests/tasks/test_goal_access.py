@@ -9,9 +9,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from making import make
-from stable_baselines3.common.env_checker import check_env
-
 from sb3_tbc.tasks import TASKS
+from stable_baselines3.common.env_checker import check_env
 
 
 @pytest.mark.parametrize("task", TASKS)
