@@ -405,10 +405,12 @@ class TBCHRL(PlainAlgorithm):
 
     @classmethod
     def load(cls: type[SelfTBCHRL], *args: Any, **kwargs: Any) -> SelfTBCHRL:
-        """Load an agent, see SB3.
+        """Load an agent, see SB3; ``device="auto"`` is the CPU, where both levels act and learn.
 
         :raises ValueError: if the environment given does not fit, naming the layout that does
         """
+        if len(args) < 3 and kwargs.get("device", "auto") == "auto":  # the third argument is the device
+            kwargs["device"] = "cpu"
         with mismatch_explained():
             return super().load(*args, **kwargs)
 
