@@ -117,12 +117,9 @@ def _flat(name: str, kind: Any, env: gym.Env[Any, Any], model: TBCHRL) -> Conten
 
 
 def warm_up(model: TBCHRL, steps: int) -> None:
-    """Learn until both levels do: a level begins to update when its buffer holds a batch."""
+    """Learn until both levels do: a level begins to update after an episode, when its buffer holds a batch."""
     model.learn(max(steps, 1000), reset_num_timesteps=False)
-    batches = [level.batch_size for level in (model.config.high, model.config.low)]
-    while model.num_timesteps <= model.config.learning_starts or any(
-        buffer.size() < batch for buffer, batch in zip(model.replay_buffer, batches, strict=True)
-    ):
+    while not (model.high._n_updates and model.low._n_updates):
         model.learn(steps, reset_num_timesteps=False)
 
 

@@ -72,7 +72,7 @@ def test_hac_levels_may_take_hindsight_goals_from_different_places() -> None:
 
 def test_flat_sac_learns_and_is_evaluated() -> None:
     model = make_flat().learn(300)
-    assert model._n_updates == 3 * 5  # a burst every hundred steps
+    assert model._n_updates == int(0.05 * (300 - 50))  # steps before learning_starts owe none
     result = evaluate_agent(model, Corridor(), 3, seed=1)
     assert result.lengths.max() <= 50
     assert np.isnan(result.subgoal_success).all()
@@ -100,7 +100,7 @@ def test_flat_replay_resumes_from_plain_arrays(tmp_path: Path) -> None:
     assert ours.ep_length[:300].min() == 0
     for key in ours.observations:
         np.testing.assert_array_equal(theirs.observations[key], ours.observations[key])
-    assert theirs.ep_length[:300].min() > 0  # the unfinished episode was closed
+    np.testing.assert_array_equal(theirs.ep_length, ours.ep_length)  # the unfinished episode goes on
     loaded.learn(100, reset_num_timesteps=False)
     assert loaded.num_timesteps == 400
     small = make_flat(buffer_size=100)
