@@ -1,0 +1,91 @@
+"""What an agent of two levels saves and loads: parameters of both levels, replay, all that learning goes on from."""
+
+from __future__ import annotations
+
+import io
+import pathlib
+from typing import Any
+
+import numpy as np
+
+from sb3_tbc.level.level import SACLevel
+from sb3_tbc.replay.both_levels import Replay
+from sb3_tbc.tbc_hrl import resume
+from sb3_tbc.tbc_hrl.assembly import LevelSpaces
+from sb3_tbc.tbc_hrl.collection import Collector
+from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
+from sb3_tbc.tbc_hrl.policy import TBCPolicy
+from sb3_tbc.tbc_hrl.reachability import Reachability
+from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
+
+
+class TwoLevelSaving(PlainAlgorithm):
+    """An agent of two levels, as far as saving and loading it goes; the agent itself builds the parts named here."""
+
+    policy: TBCPolicy
+    high: SACLevel
+    low: SACLevel
+    replay_buffer: Replay
+    reachability: Reachability | None
+    rng: np.random.Generator
+    diagnostics: EpisodeDiagnostics
+    collector: Collector | None
+    _resumed: dict[str, Any]
+
+    def _make_replay(self, high_spaces: LevelSpaces, low_spaces: LevelSpaces, high_seed: int, low_seed: int) -> None:
+        """Empty replay buffers for both levels, and what fills them."""
+        raise NotImplementedError
+
+    def learning_state(self) -> dict[str, np.ndarray[Any, Any]]:
+        """What learning goes on from besides weights and replay, as plain arrays: random streams, open options."""
+        return resume.get_state(self._moving_parts())
+
+    def _moving_parts(self) -> resume.LearningState:
+        return resume.LearningState(
+            self.num_timesteps, self.high, self.low, self.replay_buffer, self.policy.rng, self.rng, self.reachability,
+            self.diagnostics, self.collector,
+        )  # fmt: skip
+
+    def _excluded_save_params(self) -> list[str]:
+        return [
+            *super()._excluded_save_params(),
+            "high", "low", "config", "rng", "layout", "rules", "high_reward", "low_level_reward", "store",
+            "diagnostics", "replay_buffer", "schedule", "reachability", "collector", "_resumed",
+            "stop_requested",
+        ]  # fmt: skip
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        state_dicts, variables = [], []
+        for name in ("high", "low"):
+            level_dicts, level_variables = getattr(self, name)._get_torch_save_params()
+            state_dicts += [f"{name}.{part}" for part in level_dicts]
+            variables += [f"{name}.{part}" for part in level_variables]
+        if self.reachability is not None:
+            state_dicts += ["reachability", "reachability.optimizer"]
+        return state_dicts, variables
+
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """Load parameters of both levels in place, see SB3."""
+        super().set_parameters(*args, **kwargs)
+        for level in (self.high, self.low):
+            level.refresh()
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """Write both levels' replay buffers, and all else that learning goes on from, to one file of plain arrays.
+
+        A model saved at the same moment (between two rollouts), loaded together with this file, goes on learning with
+        ``learn(..., reset_num_timesteps=False)`` as if it had never stopped, bit for bit.
+        """
+        self.replay_buffer.save(path, self.learning_state())
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """Read what :meth:`save_replay_buffer` wrote; only plain arrays are read, never pickled objects.
+
+        :param truncate_last_traj: for SB3's sake; unfinished episodes are never in the buffers
+        :raises ValueError: if the file was written for other spaces or sizes
+        """
+        if getattr(self, "replay_buffer", None) is None:
+            levels: Any = (self.high, self.low)
+            high, low = (LevelSpaces(level.observation_space, level.action_space) for level in levels)
+            self._make_replay(high, low, *self.rng.integers(2**31, size=2).tolist())
+        self._resumed = self.replay_buffer.load(path)
