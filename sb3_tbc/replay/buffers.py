@@ -41,10 +41,8 @@ class OptionReplayBuffer(RingBuffer):
     """The high level's SMDP transitions; ``discounts`` carries ``gamma ** duration`` (SB3 reads it per sample).
 
     :param context: also keep what a teacher of time budgets needs of each option's first state
+    :param teacher: gives the labels of :meth:`sample_labelled`; it reads what ``context`` keeps
     """
-
-    teacher: Teacher | None = None
-    """Gives the labels of :meth:`sample_labelled`."""
 
     def __init__(
         self,
@@ -54,6 +52,7 @@ class OptionReplayBuffer(RingBuffer):
         device: th.device | str = "cpu",
         seed: int | None = None,
         context: SubgoalSpace | None = None,
+        teacher: Teacher | None = None,
     ) -> None:
         observation, action = observation_space.shape[0], action_space.shape[0]
         widths = {
@@ -67,6 +66,7 @@ class OptionReplayBuffer(RingBuffer):
         if context is not None:
             widths |= {"local": context.local_dim, "here": context.dim}
         super().__init__(buffer_size, observation_space, action_space, widths, device, seed)
+        self.teacher = teacher
 
     def extend(self, steps: HighLevelSteps) -> None:
         """Add the transitions of an episode; the time budget is left out where the level does not choose it."""
@@ -79,7 +79,7 @@ class OptionReplayBuffer(RingBuffer):
         :raises HierarchyError: without a teacher
         """
         if self.teacher is None:
-            raise HierarchyError("labelled samples need a teacher: set replay_buffer.teacher")
+            raise HierarchyError("labelled samples need a teacher: pass teacher= to the replay buffer")
         at = self.rng.integers(0, self.size(), gradient_steps * batch_size)
         taken = self._take(at)
         labels = self.teacher(*(taken[name] for name in ("observations", "local", "here")))
@@ -110,13 +110,12 @@ class SubgoalReplayBuffer(RingBuffer):
     :param n_hindsight_goals: n above, relabelled samples per plain one
     :param reward: the low level's reward, by default the sparse one
     :param hindsight: ``"timed"``, ``"future"`` or ``"episode"``
-    :param sequence_length: with more than 1, memory states are not the stored ones but recomputed by :attr:`advance`
+    :param sequence_length: with more than 1, memory states are not the stored ones but recomputed by ``advance``
         through up to ``sequence_length - 1`` preceding steps of the same window, under the sampled subgoal
     :param reach_pairs: keep what :meth:`sample_pairs` needs
+    :param advance: computes the memory states of the next step; without it the stored ones are sampled
     :raises ValueError: if ``hindsight`` is unknown or ``sequence_length`` not positive, or more than 1 without memory
     """
-
-    advance: Advance | None = None
 
     def __init__(
         self,
@@ -134,6 +133,7 @@ class SubgoalReplayBuffer(RingBuffer):
         hindsight: str = "timed",
         sequence_length: int = 1,
         reach_pairs: bool = False,
+        advance: Advance | None = None,
     ) -> None:
         if hindsight not in HINDSIGHT_SUBGOALS:
             raise ValueError(f"hindsight must be one of {', '.join(HINDSIGHT_SUBGOALS)}, got {hindsight!r}")
@@ -166,6 +166,7 @@ class SubgoalReplayBuffer(RingBuffer):
         self.layout, self.rules, self.gamma = layout, rules, gamma
         self.reward = reward or LowLevelReward("sparse", subgoals, rules)
         self.hindsight, self.n_hindsight_goals, self.sequence_length = hindsight, n_hindsight_goals, sequence_length
+        self.advance = advance
 
     def extend(self, steps: LowLevelSteps) -> None:
         """Add the transitions of an episode, in the order they happened."""

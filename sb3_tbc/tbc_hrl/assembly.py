@@ -222,18 +222,18 @@ def make_high_buffer(
     reachability: Reachability | None,
 ) -> OptionReplayBuffer:
     """Replay of options, with time budgets to learn from where the reachability estimate teaches them."""
-    taught = reachability is not None and config.duration_loss_coef > 0
-    buffer = OptionReplayBuffer(
+    teacher = None
+    if reachability is not None and config.duration_loss_coef > 0:
+        teacher = DurationTeacher(ReachRule(views, rules, reachability, config.kappa), high)
+    return OptionReplayBuffer(
         config.high.buffer_size,
         ends.observation,
         ends.action,
         device=device,
         seed=seed,
-        context=views.subgoals if taught else None,
+        context=None if teacher is None else views.subgoals,
+        teacher=teacher,
     )
-    if taught and reachability is not None:
-        buffer.teacher = DurationTeacher(ReachRule(views, rules, reachability, config.kappa), high)
-    return buffer
 
 
 def make_low_buffer(
@@ -247,7 +247,7 @@ def make_low_buffer(
 ) -> SubgoalReplayBuffer:
     """Replay of the low level's steps, which draws their hindsight subgoals."""
     own = config.low
-    buffer = SubgoalReplayBuffer(
+    return SubgoalReplayBuffer(
         own.buffer_size,
         ends.observation,
         ends.action,
@@ -262,6 +262,5 @@ def make_low_buffer(
         hindsight=(own.goal_strategy or config.goal_strategy) if config.low_reward == "step" else "timed",
         sequence_length=config.sequence_length,
         reach_pairs=config.duration == "rule" or config.duration_loss_coef > 0,
+        advance=low.advance,
     )
-    buffer.advance = low.advance
-    return buffer

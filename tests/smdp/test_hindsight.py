@@ -329,9 +329,10 @@ def test_originals_are_kept_beside_their_hindsight_copies() -> None:
 
 
 def test_burn_in_recomputes_memory_through_the_window() -> None:
-    buffer = low_buffer(100, hindsight=0, sequence_length=3)
+    buffer = low_buffer(
+        100, hindsight=0, sequence_length=3, advance=lambda observations, states: 0.5 * states + observations[:, :1]
+    )
     buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
-    buffer.advance = lambda observations, states: 0.5 * states + observations[:, :1]
     batch = buffer.sample_burst(1, 200)
     row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
     # state before row 2: 0.5 * (0.5 * 0 + position of row 0) + position of row 1; memory begins anew at row 3
@@ -342,18 +343,18 @@ def test_burn_in_recomputes_memory_through_the_window() -> None:
 
 def test_burn_in_starts_from_the_stored_state_where_it_is_shorter_than_the_window() -> None:
     steps = low_level_steps(episode(), ENV.subgoals, RULES)
-    buffer = low_buffer(100, hindsight=0, sequence_length=2)
+    buffer = low_buffer(100, hindsight=0, sequence_length=2, advance=lambda observations, states: states + 10.0)
     buffer.extend(steps._replace(states=np.arange(5.0)[:, None] * np.ones((5, 2))))
-    buffer.advance = lambda observations, states: states + 10.0
     batch = buffer.sample_burst(1, 200)
     row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
     np.testing.assert_allclose(batch.states[0, :, 0].numpy(), np.array([0, 10, 11, 3, 13])[row])
 
 
 def test_burn_in_sees_the_sampled_subgoal_and_its_time() -> None:
-    buffer = low_buffer(100, hindsight=1e9, sequence_length=2)
+    buffer = low_buffer(
+        100, hindsight=1e9, sequence_length=2, advance=lambda observations, states: observations[:, 3:5]
+    )
     buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
-    buffer.advance = lambda observations, states: observations[:, 3:5]
     batch = buffer.sample_burst(1, 500)
     observations, states = batch.observations[0].numpy(), batch.states[0].numpy()
     later = ~np.isin(np.rint(observations[:, 0] / 0.1), [0, 3])  # not the first step of a window
