@@ -80,7 +80,8 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
                 variant = args.variant or variant_name(args.ablation, args.config)
                 arguments = ["--algo", algo, "--env", name, "--seed", str(seed), "--variant", variant, *_shared(args)]
                 folder, target = (
-                    RunFolder.of(root.absolute(), task, algo, variant, seed) for root in (args.log_folder, args.ledger)
+                    RunFolder.for_run(root.absolute(), task, algo, variant, seed)
+                    for root in (args.log_folder, args.ledger)
                 )
                 yield Job(algo, name, seed, folder, target, tuple(arguments), args.n_timesteps or run.n_timesteps)
 

@@ -204,7 +204,7 @@ def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> 
         folder = RunFolder(args.resume)
         return folder, resume_run(folder, options, args.n_timesteps)
     spec = build_spec(args)
-    folder = RunFolder.of(args.log_folder, spec.run.task, spec.run.algo, spec.variant, spec.seed)
+    folder = RunFolder.for_run(args.log_folder, spec.run.task, spec.run.algo, spec.variant, spec.seed)
     line = shlex.join(["python", "-m", "sb3_tbc.train", *argv])
     if args.ledger is not None:
         _ledger_folder(args.ledger, spec.identity).require_empty()
@@ -212,7 +212,7 @@ def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> 
 
 
 def _ledger_folder(ledger: Path, identity: dict[str, Any]) -> RunFolder:
-    return RunFolder.of(ledger, identity["task"], identity["algo"], identity["variant"], identity["seed"])
+    return RunFolder.for_run(ledger, identity["task"], identity["algo"], identity["variant"], identity["seed"])
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -35,7 +35,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(root: Path) -> RunFolder:
-    return RunFolder.of(root, "Pendulum", "tbc-hrl", "full", 5)
+    return RunFolder.for_run(root, "Pendulum", "tbc-hrl", "full", 5)
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> str:
@@ -203,7 +203,7 @@ def test_ctrl_c_saves_and_resume_finishes(
     monkeypatch.setattr(SuccessEvalCallback, "_on_step", interrupt)
     arguments = ["--algo", "hits", "--config", "paper", "--n-timesteps", "300", "--log-folder", str(tmp_path)]
     assert train.main([*arguments, *SHORT, *TINY]) == 130
-    folder = RunFolder.of(tmp_path, "Pendulum", "hits", "full-paper", 0)
+    folder = RunFolder.for_run(tmp_path, "Pendulum", "hits", "full-paper", 0)
     assert f"--resume {folder.path}" in capsys.readouterr().err
     assert not folder.finished
     monkeypatch.setattr(SuccessEvalCallback, "_on_step", original)
@@ -212,7 +212,7 @@ def test_ctrl_c_saves_and_resume_finishes(
     ledger = tmp_path / "results"
     assert train.main(["--resume", str(folder.path), "--no-progress", "--ledger", str(ledger)]) == 0
     assert folder.read_final()["n_timesteps"] == 300
-    assert RunFolder.of(ledger, "Pendulum", "hits", "full-paper", 0).finished
+    assert RunFolder.for_run(ledger, "Pendulum", "hits", "full-paper", 0).finished
 
 
 @pytest.mark.parametrize(
@@ -324,7 +324,7 @@ def test_baselines_go_through_the_same_doors(algo: str, tmp_path: Path, capsys: 
     printed = capsys.readouterr().out
     assert ("subgoals reached" in printed) == (algo == "hac")
     assert "nan" not in printed
-    folder = RunFolder.of(tmp_path, "Drawbridge", algo, "full", 0)
+    folder = RunFolder.for_run(tmp_path, "Drawbridge", algo, "full", 0)
     final = folder.read_final()
     assert final["algo"] == algo
     assert (final["subgoal_success"] is None) == (algo == "sac")
@@ -342,6 +342,6 @@ def test_ablations_print_their_parameters(tmp_path: Path, capsys: pytest.Capture
     arguments = ["--ablation", "no-ndbc", "--n-timesteps", "200", "--log-folder", str(tmp_path)]
     assert train.main([*arguments, *SHORT, *TINY]) == 0
     assert "no-ndbc: " in capsys.readouterr().out
-    folder = RunFolder.of(tmp_path, "Pendulum", "tbc-hrl", "no-ndbc", 0)
+    folder = RunFolder.for_run(tmp_path, "Pendulum", "tbc-hrl", "no-ndbc", 0)
     assert folder.read_final()["variant"] == "no-ndbc"
     assert folder.read_config()["model"]["low"]["policy_kwargs"]["ndbc"] is None

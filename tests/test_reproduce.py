@@ -36,7 +36,7 @@ def test_ablations_have_folders_of_their_own(tmp_path: Path) -> None:
 
 
 def test_finished_runs_are_not_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    done = RunFolder.of(tmp_path / "results", "Pendulum", "hits", "full", 0)
+    done = RunFolder.for_run(tmp_path / "results", "Pendulum", "hits", "full", 0)
     done.path.mkdir(parents=True)
     for name in LEDGER_FILES:
         (done.path / name).write_text("{}")
@@ -71,7 +71,7 @@ def test_a_small_campaign_fills_the_ledger(tmp_path: Path, capsys: pytest.Captur
     arguments = campaign(tmp_path, "--seeds", "1", *small)
     assert reproduce.main(arguments) == 0
     for algo in ("hits", "tbc-hrl"):
-        folder = RunFolder.of(tmp_path / "results", "Pendulum", algo, "full", 0)
+        folder = RunFolder.for_run(tmp_path / "results", "Pendulum", algo, "full", 0)
         assert sorted(p.name for p in folder.path.iterdir()) == sorted(LEDGER_FILES)
     assert reproduce.main(arguments) == 0
     assert "0 to do" in capsys.readouterr().out

@@ -250,7 +250,7 @@ class SubgoalReplayBuffer(RingBuffer):
         """Rewards and ends of relabelled steps."""
         if self.reward.kind == "sparse" and self.rules.window_end == "timed":
             return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
-        return self.reward.of(here, achieved, subgoal, expired)
+        return self.reward.rewards_and_ends(here, achieved, subgoal, expired)
 
     def _states(
         self, at: NDArray[np.int64], taken: dict[str, Float32], observations: Float32

@@ -79,7 +79,7 @@ def low_level_steps(
     subgoal = np.stack([option.subgoal for option in episode.options])[per_step]
     seen = _rows(episode, np.arange(episode.length + 1))
     local, points = subgoals.local(seen), subgoals.achieved(seen)
-    rewards, over = reward.of(
+    rewards, over = reward.rewards_and_ends(
         points[:-1], points[1:], subgoal, position + 1 >= budget, may_end=position + 1 >= rules.dt_min
     )
     return LowLevelSteps(
@@ -233,7 +233,7 @@ def high_level_steps(
     testing = np.array([option.testing for option in episode.options])
     before, after = _rows(episode, starts), _rows(episode, ends)
     local, here = subgoals.local(before), subgoals.achieved(before)
-    rewards = reward.of(episode.rewards, starts, durations)
+    rewards = reward.window_rewards(episode.rewards, starts, durations)
     bonus = reward.completion_bonus * (reached | changed)
     dones = np.zeros(n, dtype=bool)
     dones[-1] = episode.terminated
@@ -312,9 +312,9 @@ def relabel_goals(
     step_rewards, met = goal_test.reward(achieved, wanted), goal_test.terminated(achieved, wanted)
     last = offsets + durations - 1
     if at_end:
-        return RelabelledGoals(reward.of(step_rewards, offsets, durations), met[last], durations)
+        return RelabelledGoals(reward.window_rewards(step_rewards, offsets, durations), met[last], durations)
     met_before: NDArray[np.int64] = np.cumsum(met) - met
     over = met_before - np.repeat(met_before[offsets], durations) > 0
-    rewards = reward.of(np.where(over, 0.0, step_rewards), offsets, durations)
+    rewards = reward.window_rewards(np.where(over, 0.0, step_rewards), offsets, durations)
     dones = np.logical_or.reduceat(met, offsets)
     return RelabelledGoals(rewards, dones, np.add.reduceat(~over, offsets).astype(np.int64))

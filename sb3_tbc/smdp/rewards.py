@@ -43,7 +43,7 @@ class LowLevelReward:
         distance = (achieved - subgoal) / (self.subgoals.high - self.subgoals.low)
         return np.asarray(np.maximum(1.0 - np.sqrt(np.square(distance).mean(axis=-1)), 0.0))
 
-    def of(
+    def rewards_and_ends(
         self,
         here: FloatArray,
         achieved: FloatArray,
@@ -102,7 +102,9 @@ class HighLevelReward:
         """Discount per environment step."""
         return float(self.gamma ** (1.0 / self.dt_ref)) if self.target == "smdp" else 1.0
 
-    def of(self, step_rewards: FloatArray, starts: NDArray[np.int64], durations: NDArray[np.int64]) -> FloatArray:
+    def window_rewards(
+        self, step_rewards: FloatArray, starts: NDArray[np.int64], durations: NDArray[np.int64]
+    ) -> FloatArray:
         """Reward of windows that lie one behind the other in ``step_rewards``, before the duration cost, ``(n,)``."""
         if self.target == "decision":
             return np.asarray(step_rewards[starts + durations - 1], dtype=np.float64)

@@ -133,7 +133,7 @@ class OptionEnv(VecEnvWrapper):
         reached = bool(self.clock.reached({key: self._seen[key][[index]] for key in GOAL_KEYS}, np.array([index]))[0])
         info["option"] = self.clock.close(index, int(duration[0]), reached, over).as_info()
         info["discount"] = float(reward.discounts(duration)[0])
-        value = reward.of(np.array(rewards), np.array([0]), duration)[0]
+        value = reward.window_rewards(np.array(rewards), np.array([0]), duration)[0]
         if self.policy.views.timed_actions:
             value -= reward.duration_cost * self.clock.time_budget[index] / self.policy.rules.dt_max
         used_up = self.clock.used[index] >= self.policy.rules.max_options

@@ -147,7 +147,7 @@ class RunFolder:
     path: Path
 
     @classmethod
-    def of(cls, root: Path, task: str, algo: str, variant: str, seed: int) -> RunFolder:
+    def for_run(cls, root: Path, task: str, algo: str, variant: str, seed: int) -> RunFolder:
         """The folder a run belongs in; slashes and colons of environment ids become underscores.
 
         :raises ConfigError: if a name would lead out of ``root`` or is no name of a folder

@@ -27,7 +27,7 @@ from sb3_tbc.zoo.ledger import LEDGER_FILES, RunFolder
 
 
 def make_job(tmp_path: Path, seed: int = 0, env: str = "Pendulum") -> Job:
-    folder, target = (RunFolder.of(tmp_path / root, env, "hits", "full", seed) for root in ("runs", "results"))
+    folder, target = (RunFolder.for_run(tmp_path / root, env, "hits", "full", seed) for root in ("runs", "results"))
     return Job("hits", env, seed, folder, target, ("--seed", str(seed)), 1000)
 
 
@@ -295,7 +295,7 @@ def test_without_a_slurm_cluster_it_is_one_line(tmp_path: Path, monkeypatch: pyt
 
 def test_hours_from_measured_speeds(tmp_path: Path) -> None:
     for seed, speed in enumerate((100.0, 200.0, 1000.0)):
-        folder = RunFolder.of(tmp_path / "results", "Pendulum", "hits", "full", seed)
+        folder = RunFolder.for_run(tmp_path / "results", "Pendulum", "hits", "full", seed)
         folder.start({}, "x")
         folder.finish({"task": "Pendulum", "algo": "hits", "variant": "full", "steps_per_second": speed})
     speeds = measured_speeds(tmp_path / "results")

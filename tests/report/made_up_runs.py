@@ -22,7 +22,7 @@ def fake_run(
     **final: Any,
 ) -> RunFolder:
     """A finished run; its curve rises to ``rate`` over four evaluations unless another is given."""
-    folder = RunFolder.of(root, task, algo, variant, seed)
+    folder = RunFolder.for_run(root, task, algo, variant, seed)
     settings = {"n_timesteps": 4000, "n_envs": 1, "n_eval_episodes": 10, "n_final_episodes": 100, **(config or {})}
     folder.start(settings, f"python -m sb3_tbc.train --algo {algo} --seed {seed}")
     versions = {"packages": {"torch": "9.9"}, "commit": commit, "python": "3.11.7", "cpu": "Abacus"}

@@ -116,7 +116,7 @@ def test_no_episode_returns_more_or_less(seed, target, gamma, costs, rewards, pe
     durations[-1] = rng.integers(1, durations[-1] + 1)  # the episode's end cuts the last window
     starts = np.concatenate([[0], np.cumsum(durations)[:-1]])
     steps = rng.choice([low, high, rng.uniform(low, high)], durations.sum())
-    gained = reward.of(steps, starts, durations) - reward.duration_cost * budgets / rules.dt_max
+    gained = reward.window_rewards(steps, starts, durations) - reward.duration_cost * budgets / rules.dt_max
     gained += reward.completion_bonus * rng.integers(0, 2, len(gained))
     if penalty is not None:
         gained = np.where(rng.random(len(gained)) < 0.5, penalty, gained)
@@ -134,7 +134,7 @@ def test_no_window_returns_more_or_less(seed: int, kind: str, gamma: float) -> N
     points = rng.choice([0.0, 0.5, 1.0], (n + 1, 2))
     subgoal = np.repeat(rng.choice([0.0, 0.5, 1.0], (1, 2)), n, axis=0)
     expired = np.arange(n) == n - 1
-    gained, over = reward.of(points[:-1], points[1:], subgoal, expired)
+    gained, over = reward.rewards_and_ends(points[:-1], points[1:], subgoal, expired)
     end = int(np.argmax(over)) + 1 if over.any() else n
     value = float((gamma ** np.arange(end) * gained[:end]).sum())
     bounds = low_level_bounds(reward, gamma)

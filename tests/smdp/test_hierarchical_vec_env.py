@@ -99,7 +99,7 @@ def test_smdp_reward_and_discount_follow_the_executed_length() -> None:
     reward = HighLevelReward("smdp", 0.9, dt_ref=5.0, dt_max=10.0, decision_cost=1.0, duration_cost=0.0)
     step = 0.9 ** (1 / 5)
     rewards = np.array([-1.0, -1.0, -1.0, 0.0])
-    value = reward.of(rewards, np.array([0, 3]), np.array([3, 1]))
+    value = reward.window_rewards(rewards, np.array([0, 3]), np.array([3, 1]))
     np.testing.assert_allclose(value, [-(1 + step + step**2) / 5 - 1, -1])
     np.testing.assert_allclose(reward.discounts(np.array([5, 1])), [0.9, step])
 

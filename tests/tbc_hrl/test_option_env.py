@@ -42,7 +42,9 @@ def test_a_step_is_an_option(agent: TBCHRL) -> None:
     for index in range(2):
         option = infos[index]["option"]
         assert option["duration"] == np.ceil(budgets[index])
-        expected = agent.high_reward.of(-np.ones(option["duration"]), np.array([0]), np.array([option["duration"]]))[0]
+        expected = agent.high_reward.window_rewards(
+            -np.ones(option["duration"]), np.array([0]), np.array([option["duration"]])
+        )[0]
         expected -= agent.high_reward.duration_cost * budgets[index] / agent.rules.dt_max
         if not dones[index]:
             assert rewards[index] == pytest.approx(expected, rel=1e-6)

@@ -45,14 +45,14 @@ def test_summary_has_the_pinned_keys_and_no_nan() -> None:
 
 
 def test_folder_layout(tmp_path: Path) -> None:
-    folder = RunFolder.of(tmp_path, "Pendulum", "tbc-hrl", "full", 3)
+    folder = RunFolder.for_run(tmp_path, "Pendulum", "tbc-hrl", "full", 3)
     assert folder.path == tmp_path / "Pendulum" / "tbc-hrl" / "full" / "seed_3"
-    foreign = RunFolder.of(tmp_path, "my_module:ns/Env-v0", "hits", "full", 0)
+    foreign = RunFolder.for_run(tmp_path, "my_module:ns/Env-v0", "hits", "full", 0)
     assert foreign.path.relative_to(tmp_path).parts[0] == "my_module_ns_Env-v0"
 
 
 def test_life_of_a_run(tmp_path: Path) -> None:
-    folder = RunFolder.of(tmp_path / "runs", "T", "a", "full", 0)
+    folder = RunFolder.for_run(tmp_path / "runs", "T", "a", "full", 0)
     assert not folder.exists
     folder.start({"algo": "a", "model": {"gamma": 0.9}}, "python -m x")
     write_evaluations(folder.evaluations, [ROW, ROW._replace(timesteps=2000)])
@@ -65,7 +65,7 @@ def test_life_of_a_run(tmp_path: Path) -> None:
     assert [f.path for f in finished_runs(tmp_path / "runs")] == [folder.path]
     (folder.path / "model.zip").write_bytes(b"large")
 
-    target = RunFolder.of(tmp_path / "results", "T", "a", "full", 0)
+    target = RunFolder.for_run(tmp_path / "results", "T", "a", "full", 0)
     folder.copy_to(target)
     assert sorted(p.name for p in target.path.iterdir()) == sorted(ledger.LEDGER_FILES)
     with pytest.raises(ConfigError, match="already holds a result"):
