@@ -102,7 +102,7 @@ def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[st
     actor = model.low.policy.average_actor
     if actor.state_dim:
         raise ConfigError("the low level of this agent is a circuit, whose answers depend on its memory: record an MLP")
-    runner = TwoLevelRunner(env, model.actor, model.layout, model.rules, np.random.default_rng(seed), model.schedule)
+    runner = TwoLevelRunner(env, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule)
     env.seed(seed)
     runner.reset()
     n_inputs, n_means = runner.observation.shape[1], int(np.prod(model.action_space.shape or ()))
@@ -115,7 +115,7 @@ def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[st
     seen = np.stack(rows)
     with th.no_grad():
         means = actor.step(th.from_numpy(seen), th.zeros(len(seen), 0))[0].numpy()
-    scaled = seen / np.asarray(model.layout.low_scale(), dtype=np.float32)
+    scaled = seen / np.asarray(model.views.low_scale(), dtype=np.float32)
     learnt = max([end for end in ends if end <= 0.85 * n_rows], default=0)
     if not learnt:
         raise ConfigError(f"no episode ended within {n_rows * every} steps: nothing to tell early from later ones by")

@@ -164,7 +164,7 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     :param task: name, for file names and comments
     :raises ConfigError: if something in the model has no exported form, saying what
     """
-    layout, rules, subgoals = model.layout, model.rules, model.layout.subgoals
+    layout, rules, subgoals = model.views, model.rules, model.views.subgoals
     if isinstance(model.schedule, ReachRule):
         raise ConfigError("an agent with duration='rule' cannot be exported: its windows come from another network")
     unit_time = None if model.schedule is None else model.schedule.unit

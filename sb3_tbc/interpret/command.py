@@ -66,7 +66,7 @@ def command(argv: Sequence[str]) -> int:
     th.set_num_threads(args.num_threads)
     info = identify(args.model, args.env, args.trust)
     model = load_two_levels(args.model, device=args.device, trust=args.trust)
-    units, space = units_of(model), space_of(info["task"], model.layout.subgoals)
+    units, space = units_of(model), space_of(info["task"], model.views.subgoals)
     if not isinstance(units, CircuitUnits) and (args.synapses or args.wiring):
         asked = "--synapses" if args.synapses else "--wiring"
         raise ConfigError(f"{asked} is about the synapses of a circuit; this agent's low level is an MLP")
@@ -83,7 +83,7 @@ def command(argv: Sequence[str]) -> int:
 
 def _write(args: Any, found: Findings, model: TBCHRL, info: dict[str, Any], episodes: HeldOutEpisodes) -> None:
     """Write the files that were asked for."""
-    space, subgoals = space_of(info["task"], model.layout.subgoals), model.layout.subgoals
+    space, subgoals = space_of(info["task"], model.views.subgoals), model.views.subgoals
     identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}
     if args.json is not None:
         about = {**identity, "n_timesteps": int(model.num_timesteps), "first_episode_seed": args.seed}

@@ -34,7 +34,7 @@ def draw_agent(model: TBCHRL, task: str, units: CircuitUnits, traces: Sequence[T
     n_actions = int(model.action_space.shape[0])  # type: ignore[index]
     return units.net.draw(
         ax,
-        input_names(task, model.layout),
+        input_names(task, model.views),
         readout=units.net.readout_weights()[:, :n_actions],  # the other outputs are standard deviations
         output_names=action_names(task, n_actions),
         used=mean_currents(units, n_actions, traces),

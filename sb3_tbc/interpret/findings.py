@@ -83,7 +83,7 @@ def investigate(
     :param effort: how many lesions
     """
     traces = episodes.record(units, no_lesion(units))
-    subgoals = model.layout.subgoals
+    subgoals = model.views.subgoals
     tables = [features_of(t, space, subgoals, model.rules.dt_max) for t in traces]
     whole = outcome_of([t.episode for t in traces])
     circuit = units if isinstance(units, CircuitUnits) else None

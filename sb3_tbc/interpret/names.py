@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sb3_tbc.smdp.views import LevelLayout
+from sb3_tbc.smdp.views import LevelViews
 
 _QUATERNION = ("q_w", "q_x", "q_y", "q_z")
 _LEGS = tuple(f"{joint}_{k}" for k in range(1, 5) for joint in ("hip", "ankle"))
@@ -37,7 +37,7 @@ ACTIONS: dict[str, tuple[str, ...]] = {
 }
 
 
-def input_names(task: str, layout: LevelLayout) -> tuple[str, ...]:
+def input_names(task: str, layout: LevelViews) -> tuple[str, ...]:
     """A name for each sensory neuron: local state, subgoal, remaining time.
 
     :param task: short name; the local state of a task that is not known here is numbered

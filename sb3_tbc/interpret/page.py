@@ -81,11 +81,11 @@ def page_data(
         "max_options": model.rules.max_options,
         "names": list(units.names),
         "layers": [{"name": name, "start": part.start, "stop": part.stop} for name, part in units.layers.items()],
-        "inputs": list(input_names(found.task, model.layout)),
-        "input_scale": model.layout.low_scale().tolist(),
+        "inputs": list(input_names(found.task, model.views)),
+        "input_scale": model.views.low_scale().tolist(),
         "actions": list(action_names(found.task, len(policy.action_low))),
         "readout": _plain(_readout(policy, len(units.names))),
-        "subgoal_names": list(model.layout.subgoals.names),
+        "subgoal_names": list(model.views.subgoals.names),
         "rest": _plain(units.rest),
         "mean": _plain(means),
         "recorded_form": "mean",
@@ -169,7 +169,7 @@ def _readout(policy: ExportedPolicy, n_units: int) -> Any:
 
 def _bounds(traces: Sequence[Trace], space: TaskSpace, model: TBCHRL) -> list[float]:
     """The part of the task's space that episodes pass through, with a margin: left, bottom, right, top."""
-    places = np.concatenate([places_of(t, space, model.layout.subgoals) for t in traces])
+    places = np.concatenate([places_of(t, space, model.views.subgoals) for t in traces])
     low, high = places.min(axis=0), places.max(axis=0)
     margin = 0.1 * np.maximum(high - low, 1e-3)
     return [float(x) for x in (*(low - margin), *(high + margin))]

@@ -67,7 +67,7 @@ def _start(k: int, trace: Trace, space: TaskSpace, model: TBCHRL, whole: dict[st
 
 def _goal_place(trace: Trace, space: TaskSpace, model: TBCHRL) -> list[float] | None:
     """Where the desired goal lies, if a goal is the beginning of a subgoal, as on most tasks."""
-    goal, subgoals = trace.episode.desired_goal[0], model.layout.subgoals
+    goal, subgoals = trace.episode.desired_goal[0], model.views.subgoals
     if len(goal) < 2 or subgoals.names[0] not in ("pan", "x", "angle"):
         return None
     point = np.concatenate([goal, np.zeros(max(0, subgoals.dim - len(goal)))])[None, : subgoals.dim]
@@ -77,7 +77,7 @@ def _goal_place(trace: Trace, space: TaskSpace, model: TBCHRL) -> list[float] | 
 def _episode(
     model: TBCHRL, env: gym.Env[Any, Any], trace: Trace, space: TaskSpace, seed: int, size: FilmSize
 ) -> dict[str, Any]:
-    episode, subgoals = trace.episode, model.layout.subgoals
+    episode, subgoals = trace.episode, model.views.subgoals
     options = [
         {
             "start": o.start, "duration": o.duration, "subgoal": np.round(o.subgoal, 4).tolist(),

@@ -103,7 +103,7 @@ def evaluate_hierarchical(
     """
     venv = _vector(env, n_eval_episodes)
     runner = TwoLevelRunner(
-        venv, model.actor, model.layout, model.rules, np.random.default_rng(seed), model.schedule, deterministic
+        venv, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule, deterministic
     )
     if seed is not None:
         venv.seed(seed)

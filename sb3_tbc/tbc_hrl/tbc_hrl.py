@@ -24,6 +24,7 @@ from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep
 from sb3_tbc.smdp.hindsight import GoalTest, check_goal_strategy
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.smdp.rewards import LowLevelReward
+from sb3_tbc.smdp.views import LevelViews
 from sb3_tbc.tbc_hrl import assembly, resume
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
@@ -131,6 +132,11 @@ class TBCHRL(TwoLevelSaving):
         """Longest time budget, environment steps."""
         return self.rules.dt_max
 
+    @property
+    def layout(self) -> LevelViews:
+        """Former name of ``views``: what each level sees and chooses."""
+        return self.views
+
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
@@ -163,20 +169,20 @@ class TBCHRL(TwoLevelSaving):
         seeds = np.random.SeedSequence(self.seed).generate_state(7).tolist()
         self.rng = np.random.default_rng(seeds[0])
         self.rules = assembly.make_rules(config, self.episode_length)
-        self.layout = assembly.make_views(config, subgoals, self.achieved_in_observation)
+        self.views = assembly.make_views(config, subgoals, self.achieved_in_observation)
         self.high_reward = assembly.make_high_reward(config, self.rules)
         self.low_level_reward = LowLevelReward(config.low_reward, subgoals, self.rules)
-        high_spaces = LevelSpaces(self.layout.high_space(space), self.layout.high_action_space())
-        low_spaces = LevelSpaces(self.layout.low_space(), spaces.Box(-1.0, 1.0, actions.shape, np.float32))
+        high_spaces = LevelSpaces(self.views.high_space(space), self.views.high_action_space())
+        low_spaces = LevelSpaces(self.views.low_space(), spaces.Box(-1.0, 1.0, actions.shape, np.float32))
         high_bounds = assembly.make_high_bounds(config, self.high_reward, self.rules, self.reward_range)
         low_bounds = assembly.make_low_bounds(config, self.low_level_reward)
         self.high = assembly.make_high_level(config, high_spaces, seeds[1], self.device, high_bounds)
-        self.low = assembly.make_low_level(config, low_spaces, seeds[2], self.device, low_bounds, self.layout)
+        self.low = assembly.make_low_level(config, low_spaces, seeds[2], self.device, low_bounds, self.views)
         self.reachability = assembly.make_reachability(config, subgoals, self.rules, seeds[6])
-        self.schedule = assembly.make_schedule(config, self.layout, self.rules, self.reachability)
+        self.schedule = assembly.make_schedule(config, self.views, self.rules, self.reachability)
         self._make_replay(high_spaces, low_spaces, seeds[3], seeds[4])
         self.policy = TBCPolicy(
-            space, actions, self.high, self.low, self.layout, self.rules, config.memory, seeds[5], self.schedule
+            space, actions, self.high, self.low, self.views, self.rules, config.memory, seeds[5], self.schedule
         )
         self.diagnostics = EpisodeDiagnostics()
 
@@ -184,15 +190,15 @@ class TBCHRL(TwoLevelSaving):
         """Empty replay buffers for both levels, and what fills them."""
         config = self.config
         self.replay_buffer = Replay(
-            assembly.make_high_buffer(config, high_spaces, high_seed, self.device, self.high, self.layout, self.rules,
+            assembly.make_high_buffer(config, high_spaces, high_seed, self.device, self.high, self.views, self.rules,
                                       self.reachability),
-            assembly.make_low_buffer(config, low_spaces, low_seed, self.device, self.low, self.layout,
+            assembly.make_low_buffer(config, low_spaces, low_seed, self.device, self.low, self.views,
                                      self.low_level_reward),
         )  # fmt: skip
         self.high.attach(self.replay_buffer.high)
         self.low.attach(self.replay_buffer.low)
         self.store = EpisodeStore(
-            self.replay_buffer, self.layout, self.rules, self.high_reward, self.low_level_reward,
+            self.replay_buffer, self.views, self.rules, self.high_reward, self.low_level_reward,
             assembly.hindsight_settings(config), self.rng,
         )  # fmt: skip
 
@@ -294,7 +300,7 @@ class TBCHRL(TwoLevelSaving):
         """
         if anew or self.collector is None:
             explore = assembly.exploration(self.config)
-            self.collector = Collector(env, self.actor, self.layout, self.rules, self.rng, self.schedule, explore)
+            self.collector = Collector(env, self.actor, self.views, self.rules, self.rng, self.schedule, explore)
             self.collector.begin(self._last_obs if anew else env.reset())  # type: ignore[arg-type]
         if resumed:
             resume.set_state(self._moving_parts(), resumed)

@@ -49,7 +49,7 @@ class TwoLevelSaving(PlainAlgorithm):
     def _excluded_save_params(self) -> list[str]:
         return [
             *super()._excluded_save_params(),
-            "high", "low", "config", "rng", "layout", "rules", "high_reward", "low_level_reward", "store",
+            "high", "low", "config", "rng", "views", "rules", "high_reward", "low_level_reward", "store",
             "diagnostics", "replay_buffer", "schedule", "reachability", "collector", "_resumed",
             "stop_requested",
         ]  # fmt: skip
