@@ -307,9 +307,12 @@ class SACUpdate:
         else:  # CrossQ has no target networks
             state.target.copy_(state.critic)
         state.average.lerp_(state.actor, row.average_weight)
-        critic_loss, q_mean, clipped = critic_diagnostics
+        critic_loss, q_mean, clipped, lowest, highest = critic_diagnostics
         diagnostics = (critic_loss, actor_loss, ent_coef_loss, ent_coef.sum(), q_mean, -log_prob.mean(), clipped)
         state.sums.add_(th.stack([value.detach() for value in diagnostics]))
+        # At the end: a change in place in the middle would keep the compiler from sharing what is computed twice.
+        so_far = state.extremes.unbind()
+        state.extremes.copy_(th.stack((th.minimum(so_far[0], lowest), th.maximum(so_far[1], highest))))
 
     def _sample(
         self, vector: th.Tensor, x: StepInputs, obs: th.Tensor, membrane: th.Tensor, noise: th.Tensor
@@ -320,7 +323,10 @@ class SACUpdate:
         return squash(mean, log_std, noise)
 
     def _critic_gradient(self, x: StepInputs, ent_coef: th.Tensor) -> tuple[th.Tensor, tuple[th.Tensor, ...]]:
-        """Gradient of half the summed mean squared errors; that loss, the mean value, the share of clipped targets."""
+        """Gradient of half the summed mean squared errors, and what is logged of it.
+
+        :return: gradient, and loss, mean value, share of clipped targets, lowest and highest target
+        """
         batch = x.given.batch
         with th.no_grad():
             observed = batch.next_observations, batch.next_states
@@ -335,7 +341,7 @@ class SACUpdate:
                 target_q, clipped = self._target_q(x, next_q, log_prob, ent_coef)
             loss = 0.5 * (q - target_q).square().mean(dim=(1, 2)).sum()
             (grad,) = th.autograd.grad(loss, leaf)
-        return grad, (loss, q.mean(), clipped)
+        return grad, (loss, q.mean(), clipped, target_q.amin(), target_q.amax())
 
     def _next_q(self, x: StepInputs, next_actions: th.Tensor) -> th.Tensor:
         """The target networks' values of the next actions, ``(n_critics, batch, 1)``."""
@@ -373,9 +379,6 @@ class SACUpdate:
             if self.bounds is not None:
                 free, target_q = target_q, self._clip(target_q, self.bounds, ent_coef)
                 clipped = (free != target_q).float().mean()
-            lowest, highest = x.state.extremes.unbind()
-            seen = th.minimum(lowest, target_q.amin()), th.maximum(highest, target_q.amax())
-            x.state.extremes.copy_(th.stack(seen))
         return target_q, clipped
 
     def _clip(self, target_q: th.Tensor, bounds: ValueBounds, ent_coef: th.Tensor) -> th.Tensor:
