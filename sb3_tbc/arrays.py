@@ -7,6 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+AnyArray = NDArray[Any]
+"""Numbers of any kind."""
+
 FloatArray = NDArray[np.floating[Any]]
 """Floating-point numbers of any precision."""
 

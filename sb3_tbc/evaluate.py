@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch as th
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
@@ -49,7 +49,7 @@ def build_parser() -> Parser:
     return parser
 
 
-def identify(path: Path, env: str | None, trust: bool = False) -> dict[str, Any]:
+def identify(path: Path, env: str | None, trust: bool = False) -> Plain:
     """What the ``.zip`` says of itself, and the environment to evaluate it on.
 
     :param path: the agent
@@ -75,8 +75,8 @@ def identify(path: Path, env: str | None, trust: bool = False) -> dict[str, Any]
 
 
 def evaluate(
-    path: Path, info: dict[str, Any], n_episodes: int, seed: int, stochastic: bool, device: str, trust: bool = False
-) -> dict[str, Any]:
+    path: Path, info: Plain, n_episodes: int, seed: int, stochastic: bool, device: str, trust: bool = False
+) -> Plain:
     """Evaluate an agent and return what is printed and written.
 
     :raises ConfigError: if agent and environment do not fit
@@ -91,7 +91,7 @@ def evaluate(
     return {**identity, "n_timesteps": int(model.num_timesteps), **summarise(result), "eval_seed": seed}
 
 
-def describe(result: Mapping[str, Any]) -> str:
+def describe(result: PlainMapping) -> str:
     """A few lines for a person; figures that an agent does not have (a flat one has no subgoals) are left out."""
     low, high = result["success_ci95"]
     count = round(result["success_rate"] * result["n_episodes"])
@@ -143,7 +143,7 @@ def command(argv: Sequence[str]) -> int:
     return 0
 
 
-def _tell(result: Mapping[str, Any], json_out: str | None) -> None:
+def _tell(result: PlainMapping, json_out: str | None) -> None:
     """Print the summary; with ``--json``, standard output is exactly the JSON and the summary goes beside it."""
     if json_out is None:
         print(describe(result))
@@ -155,7 +155,7 @@ def _tell(result: Mapping[str, Any], json_out: str | None) -> None:
         print(describe(result), file=sys.stderr)
 
 
-def _watch(path: Path, info: Mapping[str, Any], n_episodes: int, seed: int, device: str, trust: bool) -> None:
+def _watch(path: Path, info: PlainMapping, n_episodes: int, seed: int, device: str, trust: bool) -> None:
     """Play episodes in a window; episode ``i`` starts from ``seed + i``.
 
     :raises ConfigError: if the environment cannot be drawn, or there is no display

@@ -8,12 +8,12 @@ import hashlib
 import io
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, FolderInUseError, WriteError
 
 try:
@@ -112,12 +112,12 @@ def save_atomic(save: Callable[[str], object], path: Path) -> None:
         save(str(temporary))
 
 
-def write_arrays(path: str | Path | io.BufferedIOBase, arrays: Mapping[str, Any]) -> None:
+def write_arrays(path: str | Path | io.BufferedIOBase, arrays: PlainMapping) -> None:
     """Write plain arrays to one file, atomically where ``path`` is a path, whose folder is made as SB3 does.
 
     :raises WriteError: if it cannot be written
     """
-    content: dict[str, Any] = dict(arrays)
+    content: Plain = dict(arrays)
     if not isinstance(path, (str, Path)):
         np.savez(path, **content)
         return

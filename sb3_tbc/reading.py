@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
+from sb3_tbc.arrays import Arrays
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 
@@ -113,7 +113,7 @@ def _size(node: yaml.Node, known: dict[int, int], depth: int) -> int:
     return size
 
 
-def read_arrays(path: Any) -> dict[str, NDArray[Any]]:
+def read_arrays(path: Any) -> Arrays:
     """The arrays of a file that :func:`~sb3_tbc.files.write_arrays` wrote; nothing is unpickled.
 
     :param path: of the file, or an open file

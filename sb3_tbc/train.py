@@ -12,6 +12,7 @@ from typing import Any
 
 import torch as th
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.commands import INTERRUPTED, Parser, add_trust, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
@@ -141,7 +142,7 @@ def variant_name(ablation: str | None, config: str | None) -> str:
     return (ablation or "full") + ("-paper" if config == "paper" else "")
 
 
-def describe(result: dict[str, Any], folder: RunFolder) -> str:
+def describe(result: Plain, folder: RunFolder) -> str:
     """What to print at the end: the result, where everything lies, and how to evaluate it."""
     low, high = result["success_ci95"]
     lines = [
@@ -199,7 +200,7 @@ def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> 
     return 0
 
 
-def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> tuple[RunFolder, dict[str, Any]]:
+def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> tuple[RunFolder, Plain]:
     if args.resume is not None:
         folder = RunFolder(args.resume)
         return folder, resume_run(folder, options, args.n_timesteps)
@@ -211,7 +212,7 @@ def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> 
     return folder, start_run(spec, folder, line, options, args.overwrite)
 
 
-def _ledger_folder(ledger: Path, identity: dict[str, Any]) -> RunFolder:
+def _ledger_folder(ledger: Path, identity: Plain) -> RunFolder:
     return RunFolder.for_run(ledger, identity["task"], identity["algo"], identity["variant"], identity["seed"])
 
 

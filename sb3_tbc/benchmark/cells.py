@@ -15,6 +15,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.benchmark.circuits import WIRING_NUMBERS
 from sb3_tbc.ndbc.closed_form import ClosedFormNDBC
 from sb3_tbc.ndbc.frozen import FrozenNDBC
@@ -116,7 +117,7 @@ def ncps_candidates() -> list[Candidate]:
     return candidates
 
 
-def cells(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
+def cells(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
     """Time all cells; lines to print, and the figures."""
     th.set_num_threads(1)
     candidates = [ndbc_candidate(k) for k in (1, 3, 6)]
@@ -134,7 +135,7 @@ def cells(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
         f"CPU time, best of {arguments.rounds} rounds in turns",
         *_table(rows),
     ]
-    figures: dict[str, Any] = {"cells": rows}
+    figures: Plain = {"cells": rows}
     if "ncps LTC, 6 unfolds" in both:
         figures["ltc_against_ndbc_k3"] = ratio(both, "ncps LTC, 6 unfolds", "NDBC K=3")
         lines += ["", f"LTC with 6 unfolds takes {figures['ltc_against_ndbc_k3']:.1f} times as long as NDBC, K = 3."]
@@ -149,9 +150,9 @@ def cells(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
 Seconds = Mapping[str, list[float]]
 
 
-def _row(candidate: Candidate, forward: Seconds, both: Seconds, step: Seconds) -> dict[str, Any]:
+def _row(candidate: Candidate, forward: Seconds, both: Seconds, step: Seconds) -> Plain:
     name = candidate.name
-    row: dict[str, Any] = {"cell": name, "parameters": candidate.parameters}
+    row: Plain = {"cell": name, "parameters": candidate.parameters}
     if name in both:
         row["forward_ms"] = 1e3 * min(forward[name])
         row["both_ms"] = 1e3 * min(both[name])
@@ -161,7 +162,7 @@ def _row(candidate: Candidate, forward: Seconds, both: Seconds, step: Seconds) -
     return row
 
 
-def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _table(rows: Sequence[PlainMapping]) -> list[str]:
     """The rows as a Markdown table."""
     columns = {"forward_ms": 2, "both_ms": 2, "against_gru": 2, "step_us": 1}
     lines = [
@@ -175,7 +176,7 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     return lines
 
 
-def growth(batch: int, rounds: int) -> tuple[list[str], dict[str, Any]]:
+def growth(batch: int, rounds: int) -> tuple[list[str], Plain]:
     """Forward + backward over K, over time, and over synapses, each with a straight line fitted."""
     eight = th.randn(batch, 8, N_INPUTS)
     jobs: dict[str, dict[int, Job]] = {
@@ -189,7 +190,7 @@ def growth(batch: int, rounds: int) -> tuple[list[str], dict[str, Any]]:
         candidate = Candidate("", 0, _first(net), None, list(net.parameters()))
         jobs["synapses"][wiring.n_synapses] = _forward_backward(candidate, eight)
     lines = ["Growth of forward + backward, ms (a straight line explains the share R2 of the variance):", ""]
-    figures: dict[str, Any] = {}
+    figures: Plain = {}
     for what, parts in jobs.items():
         seconds = in_turns({str(size): job for size, job in parts.items()}, rounds)
         line, figures[what] = _straight_line(what, {size: 1e3 * min(seconds[str(size)]) for size in parts}, "ms")
@@ -201,7 +202,7 @@ def growth(batch: int, rounds: int) -> tuple[list[str], dict[str, Any]]:
     return lines, figures
 
 
-def _straight_line(what: str, times: Mapping[int, float], unit: str) -> tuple[str, dict[str, Any]]:
+def _straight_line(what: str, times: Mapping[int, float], unit: str) -> tuple[str, Plain]:
     """A line of text and the figures of one curve, with the share of variance that a straight line explains."""
     x, y = np.array(list(times), dtype=float), np.array(list(times.values()))
     rest = y - np.polyval(np.polyfit(x, y, 1), x)

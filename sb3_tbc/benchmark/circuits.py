@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.ndbc.diagnostics import count_parameters
 from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.ndbc.wiring import NDBCWiring
@@ -74,7 +75,7 @@ def _shipped_circuit(task: str, config: str) -> ShippedCircuit:
     return ShippedCircuit(task, config, wiring, numbers.get("sub_steps", 3), n_actions, hidden)
 
 
-def parameters() -> tuple[list[str], dict[str, Any]]:
+def parameters() -> tuple[list[str], Plain]:
     """The shipped circuits as SAC actors of the low level, beside the MLP of the task's configuration."""
     lines = [
         "| task | neurons | synapses | NDBC actor | MLP it replaces | MLP actor | share |",

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
@@ -93,7 +94,7 @@ def benchmark(argv: Sequence[str]) -> int:
     return 0
 
 
-def _measure(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
+def _measure(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
     if arguments.subject == "cells":
         from sb3_tbc.benchmark import cells as benchmark_cells
 
@@ -114,7 +115,7 @@ def _measure(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
     return parameters()
 
 
-def _record(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
+def _record(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
     from sb3_tbc.benchmark.skills import record_file
 
     out = Path(arguments.out) if arguments.out else None

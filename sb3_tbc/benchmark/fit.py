@@ -11,12 +11,13 @@ import argparse
 import copy
 import itertools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch as th
 from torch import nn
 
+from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.benchmark.circuits import WIRING_NUMBERS, paper_numbers
 from sb3_tbc.benchmark.skills import Skill, load_skill, skill_names
 from sb3_tbc.errors import ConfigError
@@ -105,7 +106,7 @@ def _circuit_option(option: str, text: str) -> tuple[str, Any]:
     return key, int(value) if value.isdigit() else value
 
 
-def make_circuit(skill: Skill, seed: int, values: Mapping[str, Any]) -> NDBCNet:
+def make_circuit(skill: Skill, seed: int, values: PlainMapping) -> NDBCNet:
     """A circuit on table A1's wiring for the skill's task (Pendulum's for delays), with some of its numbers changed."""
     given = dict(values)
     numbers = {**paper_numbers(skill.name if not skill.name.startswith("delay") else "Pendulum")}

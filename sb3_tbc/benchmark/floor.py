@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch as th
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.level.level import SACLevel
 
 Shape = tuple[int, int, int, int]
@@ -27,9 +28,7 @@ class ProductCounter(TorchDispatchMode):
         super().__init__()  # type: ignore[no-untyped-call]
         self.shapes: Counter[Shape] = Counter()
 
-    def __torch_dispatch__(
-        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
-    ) -> Any:
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Plain | None = None) -> Any:
         aten = th.ops.aten
         if func in (aten.mm.default, aten.addmm.default, aten.bmm.default, aten.baddbmm.default):
             left, right = args[-2:]

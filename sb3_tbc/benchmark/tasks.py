@@ -19,6 +19,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_tbc.aliases import Env
 from sb3_tbc.tasks import TASKS, register_tasks
 
 PUBLIC = {
@@ -51,7 +52,7 @@ def steps_per_second(env: Any, actions: Actions, seed: int | None = 0) -> float:
     return len(rows) / (time.process_time() - start)
 
 
-def engine_share(env: gym.Env[Any, Any], actions: Actions, seed: int = 0) -> float:
+def engine_share(env: Env, actions: Actions, seed: int = 0) -> float:
     """Share of a step's time that is spent in advancing the physics."""
     task: Any = env.unwrapped
     advance: Callable[[list[float]], None] = task._advance
@@ -71,7 +72,7 @@ def engine_share(env: gym.Env[Any, Any], actions: Actions, seed: int = 0) -> flo
         del task._advance
 
 
-def random_actions(env: gym.Env[Any, Any], n_steps: int, seed: int) -> Actions:
+def random_actions(env: Env, n_steps: int, seed: int) -> Actions:
     """Uniform actions ``(n_steps, action_dim)`` in float32."""
     space: Any = env.action_space
     return np.random.default_rng(seed).uniform(space.low, space.high, (n_steps, *space.shape)).astype(np.float32)

@@ -21,6 +21,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
+from sb3_tbc.aliases import Env, Plain, Space
 from sb3_tbc.benchmark.floor import gemm_rate, products
 from sb3_tbc.benchmark.profile import OUTSIDE, PARTS, profile
 from sb3_tbc.errors import ConfigError
@@ -44,7 +45,7 @@ BUDGET_MINUTES = {
 ROW_LIMIT = 50_000
 """Rows written at once where buffers are filled up artificially."""
 
-Figures = dict[str, Any]
+Figures = Plain
 Result = tuple[list[str], Figures]
 
 
@@ -89,7 +90,7 @@ def contenders(task: str, config: str | None = None) -> list[Contender]:
     found = [Contender("TBC-HRL", lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)]
     from stable_baselines3 import SAC
 
-    kinds: dict[str, Any] = {"SB3 SAC": SAC}
+    kinds: Plain = {"SB3 SAC": SAC}
     if find_spec("sbx") is not None:
         kinds["SBX SAC"] = import_module("sbx").SAC
     task, env_id = resolve_env(task)
@@ -100,7 +101,7 @@ def contenders(task: str, config: str | None = None) -> list[Contender]:
     return found
 
 
-def _flat(name: str, kind: Any, env: gym.Env[Any, Any], model: TBCHRL) -> Contender:
+def _flat(name: str, kind: Any, env: Env, model: TBCHRL) -> Contender:
     settings, ratio = model.config.low.to_dict(), model.config.gradient_ratio
     flat = kind(
         "MlpPolicy",
@@ -235,21 +236,21 @@ def update(rounds: int, batch_size: int = 256, burst: int = 64) -> Result:
     return [*lines, f"| ratio | {theirs / mine:.2f} |"], {"ms": rows, "ratio": theirs / mine}
 
 
-class _SpacesEnv(gym.Env[Any, Any]):
+class _SpacesEnv(Env):
     """Random observations in the low level's spaces, so that SB3's networks have the circuit's inputs and outputs."""
 
-    def __init__(self, observation_space: gym.Space[Any], action_space: gym.Space[Any]) -> None:
+    def __init__(self, observation_space: Space, action_space: Space) -> None:
         self.observation_space, self.action_space = observation_space, action_space
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Plain | None = None) -> tuple[Any, Plain]:
         super().reset(seed=seed)
         return self.np_random.standard_normal(self.observation_space.shape or ()).astype(np.float32), {}
 
-    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, Plain]:
         return self.reset()[0], 0.0, False, False, {}
 
 
-def _level_env(model: TBCHRL) -> gym.Env[Any, Any]:
+def _level_env(model: TBCHRL) -> Env:
     return _SpacesEnv(model.low.observation_space, model.low.action_space)
 
 

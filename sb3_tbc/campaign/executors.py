@@ -9,10 +9,11 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any, Protocol
 
+from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
@@ -140,7 +141,7 @@ class SlurmExecutor:
     :raises ConfigError: where there is no Slurm, or for a setting that submitit does not know
     """
 
-    def __init__(self, folder: Path, settings: Mapping[str, Any], cluster: str = "slurm") -> None:
+    def __init__(self, folder: Path, settings: PlainMapping, cluster: str = "slurm") -> None:
         submitit = require("submitit", extra="cluster", what="--executor slurm")
         try:
             self.executor = submitit.AutoExecutor(folder=folder, cluster=cluster)

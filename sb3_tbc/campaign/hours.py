@@ -6,8 +6,8 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
-from typing import Any
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import finished_runs
@@ -20,7 +20,7 @@ def measured_speeds(ledger: Path) -> Speeds:
     """Median environment steps per second of finished runs, per task and algorithm and per task."""
     found: dict[tuple[str, str], list[float]] = defaultdict(list)
     for folder in finished_runs(ledger):
-        final: dict[str, Any] = folder.read_final()
+        final: Plain = folder.read_final()
         speed = final.get("steps_per_second")
         if isinstance(speed, int | float) and speed > 0:
             for key in ((str(final["task"]), str(final["algo"])), (str(final["task"]), "")):

@@ -13,10 +13,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Env, PlainMapping
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import Circuit, ExportedPolicy
 from sb3_tbc.extras import require
@@ -29,7 +29,7 @@ CLOSED_FORM_TOLERANCE = 0.05
 """Larger differences of actions, as a share of half their range, draw a warning."""
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
-Observation = Mapping[str, NDArray[Any]]
+Observation = Mapping[str, AnyArray]
 
 
 class Player(Protocol):
@@ -38,7 +38,7 @@ class Player(Protocol):
     def reset(self) -> None:
         """Begin an episode."""
 
-    def step(self, observation: Observation) -> NDArray[Any]:
+    def step(self, observation: Observation) -> AnyArray:
         """The action for an observation."""
 
 
@@ -61,7 +61,7 @@ class NumpyPlayer:
         """Begin an episode."""
         self.state = self.module.initial_state()
 
-    def step(self, observation: Observation) -> NDArray[Any]:
+    def step(self, observation: Observation) -> AnyArray:
         """The action for an observation."""
         self.module.CLOSED_FORM = self.closed_form
         action, self.state = self.module.step(*(observation[key] for key in GOAL_KEYS), self.state)
@@ -90,7 +90,7 @@ class OnnxPlayer:
         self.state = {i.name: np.zeros((1, i.shape[1]), kinds[i.type]) for i in self.inputs}
         self.state["elapsed"] -= 1.0
 
-    def step(self, observation: Observation) -> NDArray[Any]:
+    def step(self, observation: Observation) -> AnyArray:
         """The action for an observation."""
         goal = {key: np.asarray(observation[key], np.float32)[None] for key in GOAL_KEYS}
         results = dict(zip(self.outputs, self.session.run(None, {**goal, **self.state}), strict=True))
@@ -125,7 +125,7 @@ class CPlayer:
         """Begin an episode."""
         self.library.tbc_reset(self._state)
 
-    def step(self, observation: Observation) -> NDArray[Any]:
+    def step(self, observation: Observation) -> AnyArray:
         """The action for an observation."""
         goal = [np.ascontiguousarray(observation[key], np.float32) for key in GOAL_KEYS]
         pointers = [part.ctypes.data_as(ctypes.c_void_p) for part in (*goal, self._action)]
@@ -213,7 +213,7 @@ def player(kind: str, path: Path, policy: ExportedPolicy) -> Player:
 
 
 def check(
-    model: TBCHRL, policy: ExportedPolicy, kind: str, path: Path, info: Mapping[str, Any], steps: int, seed: int
+    model: TBCHRL, policy: ExportedPolicy, kind: str, path: Path, info: PlainMapping, steps: int, seed: int
 ) -> str:
     """Play the exported policy beside ``predict(deterministic=True)`` on the observations the agent meets.
 
@@ -239,7 +239,7 @@ def check(
         env.close()
 
 
-def compare(model: TBCHRL, exported: Player, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> CheckResult:
+def compare(model: TBCHRL, exported: Player, env: Env, steps: int, seed: int = 0) -> CheckResult:
     """The comparison itself, see :func:`check`."""
     beside = _Beside(model, exported)
     score = play(beside, env, steps, seed)
@@ -249,7 +249,7 @@ def compare(model: TBCHRL, exported: Player, env: gym.Env[Any, Any], steps: int,
 
 
 def compare_closed_form(
-    model: TBCHRL, exported: CPlayer | NumpyPlayer, env: gym.Env[Any, Any], steps: int, seed: int = 0
+    model: TBCHRL, exported: CPlayer | NumpyPlayer, env: Env, steps: int, seed: int = 0
 ) -> ClosedFormResult:
     """The closed form of an exported circuit beside the agent, and then alone."""
     exported.closed_form = True
@@ -261,7 +261,7 @@ def compare_closed_form(
     return ClosedFormResult(beside, play(exported, env, steps, seed), half_range)
 
 
-def play(who: Player, env: gym.Env[Any, Any], steps: int, seed: int = 0) -> Score:
+def play(who: Player, env: Env, steps: int, seed: int = 0) -> Score:
     """Let a player act for some steps; episodes follow one another, the last one is cut."""
     observation, _ = env.reset(seed=seed)
     finished = successes = 0
@@ -279,8 +279,8 @@ class _Beside:
 
     def __init__(self, model: TBCHRL, exported: Player) -> None:
         self.model, self.exported = model, exported
-        self.state: tuple[NDArray[Any], ...] | None = None
-        self.differences: list[NDArray[Any]] = []
+        self.state: tuple[AnyArray, ...] | None = None
+        self.differences: list[AnyArray] = []
         self.episodes, self.windows = 1, 0
 
     def reset(self) -> None:
@@ -289,7 +289,7 @@ class _Beside:
         self.state = None
         self.episodes += 1
 
-    def step(self, observation: Observation) -> NDArray[Any]:
+    def step(self, observation: Observation) -> AnyArray:
         """The agent's action for an observation."""
         action, self.state = self.model.predict(dict(observation), self.state, deterministic=True)
         self.differences.append(action - self.exported.step(observation))

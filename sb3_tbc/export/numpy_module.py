@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.export.policy import Circuit, ExportedPolicy
 from sb3_tbc.outside import in_docstring
 
@@ -21,8 +22,8 @@ def to_numpy_module(policy: ExportedPolicy) -> str:
     """
     if isinstance(policy.low, Circuit) and policy.low.lean:
         policy = replace(policy, low=_with_silent_sensory(policy.low))
-    arrays: dict[str, Any] = {}
-    settings: dict[str, Any] = {}
+    arrays: Plain = {}
+    settings: Plain = {}
     for name, value in policy.plain().items():
         if name in ("high", "low"):
             for part, content in value.items():
@@ -54,7 +55,7 @@ def _with_silent_sensory(c: Circuit) -> Circuit:
     return replace(c, sensory_gain=silent, sensory_threshold=silent, from_inputs=np.concatenate([rows, c.from_inputs]))
 
 
-def _sort(name: str, value: Any, arrays: dict[str, Any], settings: dict[str, Any]) -> None:
+def _sort(name: str, value: Any, arrays: Plain, settings: Plain) -> None:
     """Arrays to the archive, everything else to the settings."""
     if isinstance(value, np.ndarray):
         arrays[name] = value

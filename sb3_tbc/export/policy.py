@@ -11,6 +11,7 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.level.policies import MLPActor, NDBCActor
 from sb3_tbc.ndbc.dissipative import DissipativeCell
@@ -152,7 +153,7 @@ class ExportedPolicy:
         """Entries of the low level's observation: local state, subgoal, remaining time."""
         return len(self.local) + self.subgoal_dim + int(self.remaining_time)
 
-    def plain(self) -> dict[str, Any]:
+    def plain(self) -> Plain:
         """All fields as dictionaries, numbers and arrays."""
         return asdict(self)
 

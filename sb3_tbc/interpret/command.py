@@ -9,6 +9,7 @@ from typing import Any
 
 import torch as th
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.evaluate import identify
@@ -81,7 +82,7 @@ def command(argv: Sequence[str]) -> int:
     return 0
 
 
-def _write(args: Any, found: Findings, model: TBCHRL, info: dict[str, Any], episodes: HeldOutEpisodes) -> None:
+def _write(args: Any, found: Findings, model: TBCHRL, info: Plain, episodes: HeldOutEpisodes) -> None:
     """Write the files that were asked for."""
     space, subgoals = space_of(info["task"], model.views.subgoals), model.views.subgoals
     identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}

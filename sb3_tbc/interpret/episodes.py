@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.interpret.units import FloatArray, Lesion, Units, stack
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.smdp.options import Episode
@@ -70,9 +71,7 @@ class HeldOutEpisodes:
     :param seed: episode i starts from ``seed + i``
     """
 
-    def __init__(
-        self, model: TBCHRL, env_id: str, env_kwargs: dict[str, Any], n_episodes: int, seed: int = FIRST_SEED
-    ) -> None:
+    def __init__(self, model: TBCHRL, env_id: str, env_kwargs: Plain, n_episodes: int, seed: int = FIRST_SEED) -> None:
         self.model, self.n_episodes, self.seed = model, n_episodes, seed
         self.make_env = partial(make_env, env_id, **env_kwargs)
         self._venvs: dict[int, _SeededVecEnv] = {}

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.interpret.correlation import Correlation, correlate
 from sb3_tbc.interpret.episodes import HeldOutEpisodes, Trace, outcome_of
 from sb3_tbc.interpret.features import TaskSpace, features_of
@@ -115,7 +115,7 @@ def investigate(
     )
 
 
-def to_plain(found: Findings, identity: Mapping[str, Any]) -> dict[str, Any]:
+def to_plain(found: Findings, identity: PlainMapping) -> Plain:
     """Plain data for a JSON file.
 
     :param identity: what the agent is, put first
@@ -151,12 +151,12 @@ def to_plain(found: Findings, identity: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _information(information: PhaseInformation) -> dict[str, Any]:
+def _information(information: PhaseInformation) -> Plain:
     bits, control = _rounded(information.bits), _rounded(information.control)
     return {"bits": bits, "control": control, "n_windows": information.n_windows}
 
 
-def _lesion(result: LesionResult) -> dict[str, Any]:
+def _lesion(result: LesionResult) -> Plain:
     plain = result._asdict()
     for name in ("success", "subgoals"):
         drop = plain[name]

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.export.policy import MLP, ExportedPolicy, extract
 from sb3_tbc.interpret.episodes import HeldOutEpisodes, Trace
 from sb3_tbc.interpret.features import TaskSpace, places_of
@@ -21,7 +22,7 @@ from sb3_tbc.interpret.text import figure_rows
 from sb3_tbc.tbc_hrl import TBCHRL
 
 SCRIPTS = ("circuit", "policy", "pendulum", "drawbridge", "recorded", "pen", "diagram", "app")
-SIMULATED: dict[str, tuple[dict[str, Any], ...]] = {
+SIMULATED: dict[str, tuple[Plain, ...]] = {
     "Pendulum": ({}, {"observation": "compact"}, {"observation": "paper"}),
     "Drawbridge": ({"observation": "compact"},),
 }
@@ -31,7 +32,7 @@ N_STARTS = 5
 
 
 def live_page(
-    model: TBCHRL, found: Findings, space: TaskSpace, episodes: HeldOutEpisodes, info: Mapping[str, Any], picture: bytes
+    model: TBCHRL, found: Findings, space: TaskSpace, episodes: HeldOutEpisodes, info: PlainMapping, picture: bytes
 ) -> str:
     """The page.
 
@@ -66,9 +67,7 @@ def live_page(
     return page
 
 
-def page_data(
-    model: TBCHRL, found: Findings, space: TaskSpace, episodes: HeldOutEpisodes, info: Mapping[str, Any]
-) -> dict[str, Any]:
+def page_data(model: TBCHRL, found: Findings, space: TaskSpace, episodes: HeldOutEpisodes, info: PlainMapping) -> Plain:
     """All numbers of the page."""
     policy, units = extract(model, found.task), found.units
     live = found.task if dict(info["env_kwargs"]) in SIMULATED.get(found.task, ()) else None
@@ -101,7 +100,7 @@ def page_data(
     }
 
 
-def live_starts(episodes: HeldOutEpisodes, traces: Sequence[Trace]) -> list[dict[str, Any]]:
+def live_starts(episodes: HeldOutEpisodes, traces: Sequence[Trace]) -> list[Plain]:
     """Where the first held-out episodes start, and how Python saw them end."""
     env, starts = episodes.make_env(), []
     for k, trace in enumerate(traces[:N_STARTS]):
@@ -116,7 +115,7 @@ def live_starts(episodes: HeldOutEpisodes, traces: Sequence[Trace]) -> list[dict
     return starts
 
 
-def plain_policy(policy: ExportedPolicy) -> dict[str, Any]:
+def plain_policy(policy: ExportedPolicy) -> Plain:
     """An exported policy as JSON's own types; infinite bounds become null."""
     plain = {name: _plain(value) for name, value in policy.plain().items()}
     plain["achieved"] = [_plain(c._asdict()) for c in policy.achieved]

@@ -8,9 +8,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 
+from sb3_tbc.aliases import Env, Plain
 from sb3_tbc.extras import require
 from sb3_tbc.interpret.episodes import HeldOutEpisodes, Trace
 from sb3_tbc.interpret.features import TaskSpace, places_of
@@ -34,7 +34,7 @@ MOST_BYTES = 2_200_000
 def recorded_starts(
     model: TBCHRL, units: Units, episodes: HeldOutEpisodes, traces: Sequence[Trace], space: TaskSpace,
     order: Sequence[int], means: FloatArray,
-) -> list[dict[str, Any]]:  # fmt: skip
+) -> list[Plain]:  # fmt: skip
     """The page's episodes: the first with lesions, as many as there is room for, and the second whole.
 
     :param order: units, those that are to be lesioned first at the beginning
@@ -55,7 +55,7 @@ def recorded_starts(
     return starts
 
 
-def _start(k: int, trace: Trace, space: TaskSpace, model: TBCHRL, whole: dict[str, Any]) -> dict[str, Any]:
+def _start(k: int, trace: Trace, space: TaskSpace, model: TBCHRL, whole: Plain) -> Plain:
     return {
         "label": f"held-out {k}" + (" (with lesions)" if k == 0 else ""),
         "goal": trace.episode.desired_goal[0].tolist(),
@@ -74,9 +74,7 @@ def _goal_place(trace: Trace, space: TaskSpace, model: TBCHRL) -> list[float] | 
     return [float(x) for x in space.place(point, trace.episode.observation[:1])[0]]
 
 
-def _episode(
-    model: TBCHRL, env: gym.Env[Any, Any], trace: Trace, space: TaskSpace, seed: int, size: FilmSize
-) -> dict[str, Any]:
+def _episode(model: TBCHRL, env: Env, trace: Trace, space: TaskSpace, seed: int, size: FilmSize) -> Plain:
     episode, subgoals = trace.episode, model.views.subgoals
     options = [
         {
@@ -98,7 +96,7 @@ def _episode(
     }
 
 
-def film(model: TBCHRL, env: gym.Env[Any, Any], trace: Trace, seed: int, size: FilmSize) -> dict[str, Any] | None:
+def film(model: TBCHRL, env: Env, trace: Trace, seed: int, size: FilmSize) -> Plain | None:
     """Take the episode's actions again and keep pictures as JPEG.
 
     :return: None if the task cannot be drawn
@@ -125,7 +123,7 @@ def film(model: TBCHRL, env: gym.Env[Any, Any], trace: Trace, seed: int, size: F
     return {"every": every, "frames": frames, "shape": shape}
 
 
-def _picture(env: gym.Env[Any, Any]) -> Any:
+def _picture(env: Env) -> Any:
     """The task's picture; None, with a notice, where it cannot draw itself: the page does without."""
     try:
         return env.render()
@@ -134,7 +132,7 @@ def _picture(env: gym.Env[Any, Any]) -> Any:
         return None
 
 
-def _overlay(env: gym.Env[Any, Any], trace: Trace, step: int, model: TBCHRL) -> None:
+def _overlay(env: Env, trace: Trace, step: int, model: TBCHRL) -> None:
     if hasattr(env.unwrapped, "set_overlay"):
         left = float(trace.steps_left[step]) / model.rules.dt_max
         env.unwrapped.set_overlay(trace.subgoal[step], min(max(left, 0.0), 1.0))
@@ -144,6 +142,6 @@ def _floats(values: FloatArray) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
 
 
-def _size(episode: dict[str, Any]) -> int:
+def _size(episode: Plain) -> int:
     frames = (episode["film"] or {"frames": []})["frames"]
     return len(episode["inputs"]) + len(episode["places"]) + sum(len(frame) for frame in frames)

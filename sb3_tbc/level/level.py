@@ -15,6 +15,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import HierarchyError, NonFiniteError
 from sb3_tbc.level.acting import FrozenActor
 from sb3_tbc.level.policies import LevelPolicy
@@ -85,7 +86,7 @@ class SACLevel(SAC):
         tau: float = 0.005,
         ent_coef: str | float = "auto",
         target_entropy: str | float = "auto",
-        policy_kwargs: dict[str, Any] | None = None,
+        policy_kwargs: Plain | None = None,
         seed: int | None = None,
         device: th.device | str = "cpu",
         compile: bool | str = "auto",

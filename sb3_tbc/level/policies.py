@@ -8,7 +8,7 @@ forward pass as a function of those blocks, which is what the update differentia
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch as th
@@ -21,6 +21,7 @@ from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACP
 from torch import nn
 from torch.nn import functional
 
+from sb3_tbc.aliases import Plain, PlainMapping, Space
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.level.critics import LevelCritic
 from sb3_tbc.level.storage import Block, linear_layers
@@ -133,7 +134,7 @@ class NDBCActor(BasePolicy):
         action_space: spaces.Box,
         features_extractor: nn.Module,
         features_dim: int,
-        ndbc: Mapping[str, Any],
+        ndbc: PlainMapping,
         mean_bound: float | None = None,
         log_std_bounds: tuple[float, float] = (LOG_STD_MIN, LOG_STD_MAX),
         normalize_images: bool = True,
@@ -155,7 +156,7 @@ class NDBCActor(BasePolicy):
         self.head = GaussianHead(mean_bound, log_std_bounds)
         self.action_dist = SquashedDiagGaussianDistribution(get_action_dim(action_space))
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
+    def _get_constructor_parameters(self) -> Plain:
         bounds = {"mean_bound": self.head.mean_bound, "log_std_bounds": self.head.log_std_bounds}
         return {**super()._get_constructor_parameters(), "ndbc": self.ndbc, **bounds}
 
@@ -230,7 +231,7 @@ class LevelPolicy(SACPolicy):
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
+        observation_space: Space,
         action_space: spaces.Box,
         lr_schedule: Schedule,
         *args: Any,
@@ -238,14 +239,14 @@ class LevelPolicy(SACPolicy):
         critic_norm: str = "none",
         mean_bound: float | None = None,
         log_std_bounds: tuple[float, float] = (LOG_STD_MIN, LOG_STD_MAX),
-        ndbc: Mapping[str, Any] | None = None,
+        ndbc: PlainMapping | None = None,
         **kwargs: Any,
     ) -> None:
         if not isinstance(observation_space, spaces.Box) or len(observation_space.shape) != 1:
             raise ConfigError(f"a level observes a flat vector (Box of one dimension), got {observation_space}")
         if kwargs.get("use_sde") or kwargs.get("share_features_extractor"):
             raise ConfigError("a level has neither use_sde nor share_features_extractor; leave both False")
-        self.level_kwargs: dict[str, Any] = {
+        self.level_kwargs: Plain = {
             "negative_critic": negative_critic,
             "critic_norm": critic_norm,
             "mean_bound": mean_bound,
@@ -258,7 +259,7 @@ class LevelPolicy(SACPolicy):
         super()._build(lr_schedule)
         self.average_actor = copy_actor(self.actor)
 
-    def _get_constructor_parameters(self) -> dict[str, Any]:
+    def _get_constructor_parameters(self) -> Plain:
         return {**super()._get_constructor_parameters(), **self.level_kwargs}
 
     def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:

@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.aliases import Space
 from sb3_tbc.errors import HierarchyError
 
 
 class SpacesOnlyVecEnv(VecEnv):
     """Spaces without an environment: SB3's algorithms ask an environment for nothing else before they step it."""
 
-    def __init__(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> None:
+    def __init__(self, observation_space: Space, action_space: Space) -> None:
         super().__init__(1, observation_space, action_space)
 
     def _refuse(self) -> HierarchyError:

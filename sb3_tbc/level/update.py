@@ -17,12 +17,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import torch as th
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_leaves, tree_unflatten
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.level.compilation import compile_step
 from sb3_tbc.level.critics import BATCH_MOMENTUM
 from sb3_tbc.level.policies import LevelPolicy
@@ -114,7 +114,7 @@ class SACUpdate:
         self._steps: dict[tuple[int, int], Callable[..., None]] = {}
         self._shapes: dict[int, list[th.Size]] = {}  # of what an update is given, by batch size
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Plain:
         state = {**self.__dict__, "_steps": {}}
         state.pop("_structure", None)
         return state

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.ndbc.wiring import NDBCWiring
 
 if TYPE_CHECKING:
     from sb3_tbc.ndbc.network import NDBCNet
 
-Values = th.Tensor | NDArray[Any]
+Values = th.Tensor | AnyArray
 
 
 def check_finite(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
+from sb3_tbc.aliases import PlainMapping, Space
 from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.ndbc.wiring import NDBCWiring
 
@@ -33,9 +34,9 @@ class NDBCExtractor(BaseFeaturesExtractor):
 
     def __init__(
         self,
-        observation_space: spaces.Space[Any],
+        observation_space: Space,
         features_dim: int = 32,
-        wiring: Mapping[str, Any] | None = None,
+        wiring: PlainMapping | None = None,
         input_scale: Sequence[float] | None = None,
         **kwargs: Any,
     ) -> None:

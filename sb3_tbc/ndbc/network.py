@@ -11,6 +11,7 @@ import torch as th
 from torch import nn
 from torch.nn import functional
 
+from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.ndbc.cell import Cell, ConductanceCell
 from sb3_tbc.ndbc.dissipative import Certificate, DissipativeCell
@@ -60,13 +61,13 @@ class NDBCNet(nn.Module):
         self,
         n_inputs: int,
         n_outputs: int,
-        wiring: NDBCWiring | Mapping[str, Any],
+        wiring: NDBCWiring | PlainMapping,
         sub_steps: int = 3,
         dynamics: str = "conductance",
         input_scale: Sequence[float] | None = None,
         readout: str = "all",
         max_rho: float | None = None,
-        adaptive_step: bool | Mapping[str, Any] = False,
+        adaptive_step: bool | PlainMapping = False,
         seed: int | None = None,
         synapses: str = "paper",
         time_constants: Mapping[str, Sequence[float] | None] | None = None,
@@ -349,7 +350,7 @@ def _check_sizes(n_inputs: int, n_outputs: int, wiring: NDBCWiring, sub_steps: i
 
 
 def _check_options(
-    dynamics: str, readout: str, max_rho: float | None, synapses: str, only_conductance: Mapping[str, Any]
+    dynamics: str, readout: str, max_rho: float | None, synapses: str, only_conductance: PlainMapping
 ) -> None:
     for name, value, allowed in (
         ("dynamics", dynamics, DYNAMICS),

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from sb3_tbc.aliases import Plain, PlainMapping
 
 SignMatrix = NDArray[np.int8]
 """Synapses as a matrix ``[presynaptic, postsynaptic]``: +1 excitatory, -1 inhibitory, 0 none."""
@@ -163,7 +165,7 @@ class NDBCWiring:
             groups.append(tuple(ready.tolist()))
         return tuple(groups)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """Plain data: sizes, seed, notes, and every synapse as ``[presynaptic, postsynaptic, polarity]``."""
         return {
             **{name: getattr(self, name) for name in ("n_inputs", *LAYERS)},
@@ -175,7 +177,7 @@ class NDBCWiring:
         }
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> NDBCWiring:
+    def from_dict(cls, data: PlainMapping) -> NDBCWiring:
         """The wiring that :meth:`to_dict` described; or, given the constructor's numbers, a freshly drawn one.
 
         :raises ValueError: if a synapse names a neuron that does not exist or has a polarity other than +1 and -1

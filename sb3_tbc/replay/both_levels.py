@@ -5,10 +5,9 @@ from __future__ import annotations
 import io
 import pathlib
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from numpy.typing import NDArray
-
+from sb3_tbc.arrays import AnyArray, Arrays
 from sb3_tbc.files import write_arrays
 from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
@@ -23,7 +22,7 @@ class Replay(NamedTuple):
     high: OptionReplayBuffer
     low: SubgoalReplayBuffer
 
-    def save(self, path: str | pathlib.Path | io.BufferedIOBase, more: Mapping[str, NDArray[Any]]) -> None:
+    def save(self, path: str | pathlib.Path | io.BufferedIOBase, more: Mapping[str, AnyArray]) -> None:
         """Write both buffers to one file of plain arrays, atomically.
 
         :param more: arrays to write into the same file
@@ -31,7 +30,7 @@ class Replay(NamedTuple):
         states = {name: buffer.get_state() for name, buffer in self._asdict().items()} | {MORE: more}
         write_arrays(path, {f"{name}.{key}": x for name, state in states.items() for key, x in state.items()})
 
-    def load(self, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, NDArray[Any]]:
+    def load(self, path: str | pathlib.Path | io.BufferedIOBase) -> Arrays:
         """Read what :meth:`save` wrote; only plain arrays are read, never pickled objects.
 
         :return: the further arrays of the file

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_tbc.aliases import Space
+from sb3_tbc.arrays import AnyArray, Arrays
 from sb3_tbc.replay.batch import LevelBatch
 
 Float32 = NDArray[np.float32]
@@ -31,8 +32,8 @@ class RingBuffer(BaseBuffer):
     def __init__(
         self,
         buffer_size: int,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
+        observation_space: Space,
+        action_space: Space,
         widths: Mapping[str, int],
         device: th.device | str = "cpu",
         seed: int | None = None,
@@ -67,7 +68,7 @@ class RingBuffer(BaseBuffer):
         """
         raise TypeError(f"{type(self).__name__} takes whole episodes: use extend(rows)")
 
-    def _extend(self, rows: Mapping[str, NDArray[Any]]) -> None:
+    def _extend(self, rows: Mapping[str, AnyArray]) -> None:
         count = len(next(iter(rows.values())))
         if count > self.buffer_size:
             raise ValueError(
@@ -102,12 +103,12 @@ class RingBuffer(BaseBuffer):
     def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
         raise NotImplementedError
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> Arrays:
         """The stored rows and the position, as plain arrays."""
         held = {name: array[: self.size()] for name, array in self.data.items()}
         return {**held, "pos": np.array(self.pos), "full": np.array(self.full)}
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def set_state(self, state: Mapping[str, AnyArray]) -> None:
         """Take over rows saved by :meth:`get_state`.
 
         :raises ValueError: if they have other quantities or widths than this buffer

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shlex
 from pathlib import Path
-from typing import Any
 
 import yaml
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.report.runs import SHIPPED, Results
 
@@ -39,7 +39,7 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
     return table
 
 
-def _command(plan: dict[str, Any], row: dict[str, Any], method: str) -> str:
+def _command(plan: Plain, row: Plain, method: str) -> str:
     algo, _, variant = method.partition(" ")
     words = ["python", "-m", "sb3_tbc.reproduce", "--tasks", row["task"], "--algos", algo]
     words += ["--first-seed", str(plan["first_seed"]), "--seeds", str(row["seeds"])]

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.zoo.callbacks import EvaluationRow
 from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
@@ -35,11 +36,11 @@ class Curve(NamedTuple):
 class Run(NamedTuple):
     """A finished run: its ``final.json``, learning curve, configuration, command and versions."""
 
-    final: dict[str, Any]
+    final: Plain
     rows: list[EvaluationRow]
-    config: Mapping[str, Any] = MappingProxyType({})
+    config: PlainMapping = MappingProxyType({})
     command: str = ""
-    versions: Mapping[str, Any] = MappingProxyType({})
+    versions: PlainMapping = MappingProxyType({})
     folder: Path = Path()
     tuned_on: bool = False  # settings of its row were chosen on this seed
 
@@ -162,7 +163,7 @@ def load_descriptions(root: Path) -> dict[str, dict[str, str]]:
     return {task: {k: str(v) for k, v in lines.items()} for task, lines in _read_table(root / DESCRIPTIONS).items()}
 
 
-def _read_table(path: Path) -> dict[str, dict[str, Any]]:
+def _read_table(path: Path) -> dict[str, Plain]:
     """A YAML file of two levels, empty where there is none.
 
     :raises ConfigError: if it cannot be read

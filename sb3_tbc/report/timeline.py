@@ -6,21 +6,22 @@ import csv
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
-from typing import Any
+
+from sb3_tbc.aliases import Plain
 
 TRACE = "options.csv"
 MOST = 40
 """Options that are drawn; of a longer episode the first ones."""
 
 
-def last_episode(path: Path) -> list[dict[str, Any]]:
+def last_episode(path: Path) -> list[Plain]:
     """The options of the last whole episode of the first environment in a trace, in order.
 
     :return: ``time_budget``, ``duration`` (environment steps), ``reached``, ``reason``; empty without a whole episode
     :raises ValueError: if the file has other columns
     """
-    episodes: list[list[dict[str, Any]]] = []
-    open_one: list[dict[str, Any]] = []
+    episodes: list[list[Plain]] = []
+    open_one: list[Plain] = []
     with path.open(encoding="utf-8", newline="") as file:
         reader = csv.DictReader(file)
         if not {"env", "time_budget", "duration", "reached", "reason", "episode_over"} <= set(reader.fieldnames or ()):
@@ -37,7 +38,7 @@ def last_episode(path: Path) -> list[dict[str, Any]]:
     return episodes[-1] if episodes else []
 
 
-def option_timeline(options: Sequence[dict[str, Any]], title: str = "") -> str:
+def option_timeline(options: Sequence[Plain], title: str = "") -> str:
     """Options of one episode from top to bottom: the budget as a pale bar, the steps used as a dark one.
 
     Reached subgoals have a tick at the end of their bar, missed ones a cross: told apart without colour.

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.settings.kinds import allows_none, arms, default_of, hints, section_of, split
 from sb3_tbc.settings.texts import describe, remark, section_text
@@ -55,7 +56,7 @@ class Settings:
         """
 
     @classmethod
-    def from_dict(cls: type[SelfSettings], given: Mapping[str, Any] | SelfSettings | None = None) -> SelfSettings:
+    def from_dict(cls: type[SelfSettings], given: PlainMapping | SelfSettings | None = None) -> SelfSettings:
         """Settings from plain data; what is not given, or given as None, has its default.
 
         :param given: values by name, sections as mappings or as settings; or the settings themselves
@@ -63,9 +64,9 @@ class Settings:
         """
         return typing.cast(SelfSettings, read({} if given is None else given, cls, "", cls()))
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """All settings as plain data: numbers, text, lists and dictionaries."""
-        result: dict[str, Any] = plain(self)
+        result: Plain = plain(self)
         return result
 
 
@@ -107,7 +108,7 @@ def read(value: Any, hint: Any, name: str, default: Any = None, partial: bool = 
     return result
 
 
-def read_partial(given: Any, kinds: Mapping[str, Any], where: str = "") -> dict[str, Any]:
+def read_partial(given: Any, kinds: PlainMapping, where: str = "") -> Plain:
     """Check some settings without adding the others.
 
     :param given: values by name
@@ -120,7 +121,7 @@ def read_partial(given: Any, kinds: Mapping[str, Any], where: str = "") -> dict[
     return {name: plain(read(value, kinds[name], _dotted(where, name), partial=True)) for name, value in given.items()}
 
 
-def _check_names(given: Any, kinds: Mapping[str, Any], where: str) -> None:
+def _check_names(given: Any, kinds: PlainMapping, where: str) -> None:
     if not isinstance(given, Mapping):
         raise SettingError(where, f"must be {section_text(kinds)}, got {given!r}")
     for name in given:

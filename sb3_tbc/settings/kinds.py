@@ -8,17 +8,18 @@ import types
 import typing
 from typing import Annotated, Any, get_args, get_origin
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.settings.domains import Domain
 
 
-def hints(section: type[Any]) -> dict[str, Any]:
+def hints(section: type[Any]) -> Plain:
     """Name of every field of a settings class and its type, domains included."""
     key: Any = section
     return _hints(key)
 
 
 @functools.cache
-def _hints(section: type[Any]) -> dict[str, Any]:
+def _hints(section: type[Any]) -> Plain:
     found = typing.get_type_hints(section, include_extras=True)
     return {field.name: found[field.name] for field in dataclasses.fields(section)}
 

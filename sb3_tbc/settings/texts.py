@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from collections.abc import Mapping
 from typing import Any, Literal, get_args, get_origin
 
+from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.settings.domains import Prefixed
 from sb3_tbc.settings.kinds import arms, hints, split
 
@@ -43,7 +43,7 @@ def _describe_kind(kind: Any) -> str:
     return _NAMES.get(kind, f"a {getattr(kind, '__name__', kind)}")
 
 
-def section_text(kinds: Mapping[str, Any]) -> str:
+def section_text(kinds: PlainMapping) -> str:
     """A section, by the keys that it may have."""
     return f"a section with some of the keys {', '.join(kinds)}"
 

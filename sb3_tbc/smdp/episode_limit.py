@@ -19,6 +19,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
+from sb3_tbc.aliases import Env, Plain
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.faults import fault
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
@@ -66,7 +67,7 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
     :param index: its number in the vector, for messages
     """
 
-    def __init__(self, env: gym.Env[Any, Any], index: int = 0) -> None:
+    def __init__(self, env: Env, index: int = 0) -> None:
         RecordConstructorArgs.__init__(self, index=index)
         gym.Wrapper.__init__(self, env)
         self.index = index
@@ -80,7 +81,7 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """End the episode with this window."""
         self._last, self._passed = window, 0
 
-    def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
+    def reset(self, **kwargs: Any) -> tuple[Any, Plain]:
         """Begin an episode, and forget what was announced."""
         self._last, self._steps = None, 0
         try:
@@ -90,7 +91,7 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._check(observation, info)
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Plain]:
         """Step; the last observation of an episode is a copy, as some environments write into the same arrays again.
 
         :raises EnvironmentFault: if the task's own code fails, naming environment and step
@@ -139,11 +140,11 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 class CopyableVecEnvWrapper(VecEnvWrapper):
     """A wrapper that can be copied and pickled: SB3's holds all that its class inherits, much of which cannot be."""
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Plain:
         """All but what the class itself tells."""
         return {name: value for name, value in self.__dict__.items() if name != "class_attributes"}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Plain) -> None:
         self.__dict__.update(state, class_attributes=dict(inspect.getmembers(type(self))))
 
 
@@ -194,7 +195,7 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
             self._returns[ended], self._lengths[ended] = 0.0, 0
         return observation, rewards, dones, infos
 
-    def _end(self, index: int, observation: Any, dones: Any, info: dict[str, Any]) -> None:
+    def _end(self, index: int, observation: Any, dones: Any, info: Plain) -> None:
         episode = {"r": float(self._returns[index]), "l": int(self._lengths[index]), "t": time.time() - self._began}
         info |= {BUDGET_EXHAUSTED: True, "TimeLimit.truncated": True, "episode": episode}
         info["terminal_observation"] = {key: np.array(part[index]) for key, part in observation.items()}
@@ -256,7 +257,7 @@ def can_tell(venv: VecEnv, subgoals: SubgoalSpace) -> bool:
     return same and (isinstance(base, DummyVecEnv) or subgoals.is_data)
 
 
-def _put_limit(env: gym.Env[Any, Any], index: int) -> gym.Env[Any, Any]:
+def _put_limit(env: Env, index: int) -> Env:
     """Put the limit around the task itself, beneath its wrappers; the outermost environment."""
     if not isinstance(env, gym.Wrapper):
         return EpisodeLimit(env, index)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from typing import Any
 
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError, EnvironmentFault, HierarchyError, NonFiniteError
 
 STEP_TIMEOUT = 60.0
@@ -24,7 +24,7 @@ def fault(index: int, step: int, error: Exception) -> Exception:
     return EnvironmentFault(f"environment {index} failed {doing}: {type(error).__name__}: {error}")
 
 
-def step_or_name(venv: VecEnv, actions: NDArray[Any], steps: NDArray[Any]) -> VecEnvStepReturn:
+def step_or_name(venv: VecEnv, actions: AnyArray, steps: AnyArray) -> VecEnvStepReturn:
     """Step a vector of environments; a worker process that died or hangs is named instead of waited for.
 
     :param steps: steps of the running episodes so far, ``(n_envs,)``, for the message
@@ -41,7 +41,7 @@ def step_or_name(venv: VecEnv, actions: NDArray[Any], steps: NDArray[Any]) -> Ve
         raise EnvironmentFault(_dead(workers, steps)) from error
 
 
-def _wait(workers: SubprocVecEnv, steps: NDArray[Any]) -> None:
+def _wait(workers: SubprocVecEnv, steps: AnyArray) -> None:
     until = time.monotonic() + STEP_TIMEOUT
     for index, (remote, process) in enumerate(zip(workers.remotes, workers.processes, strict=True)):
         while not remote.poll(min(max(until - time.monotonic(), 0.0), 0.5)):
@@ -54,7 +54,7 @@ def _wait(workers: SubprocVecEnv, steps: NDArray[Any]) -> None:
                 )
 
 
-def _dead(workers: SubprocVecEnv, steps: NDArray[Any]) -> str:
+def _dead(workers: SubprocVecEnv, steps: AnyArray) -> str:
     processes: list[Any] = workers.processes
     until = time.monotonic() + 1.0  # a process that has just closed its pipe takes a moment to be gone
     while time.monotonic() < until and all(process.is_alive() for process in processes):

@@ -7,11 +7,13 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
+from sb3_tbc.aliases import Space
+
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 """The parts of a goal environment's observation."""
 
 
-def goal_space_problems(observation: spaces.Space[Any], action: spaces.Space[Any] | None = None) -> list[str]:
+def goal_space_problems(observation: Space, action: Space | None = None) -> list[str]:
     """What keeps a hierarchical agent from acting in an environment with these spaces; empty if nothing.
 
     :param observation: the environment's observation space
@@ -33,7 +35,7 @@ def goal_space_problems(observation: spaces.Space[Any], action: spaces.Space[Any
     return found
 
 
-def _action_problems(action: spaces.Space[Any]) -> list[str]:
+def _action_problems(action: Space) -> list[str]:
     if not isinstance(action, spaces.Box) or len(action.shape) != 1:
         return [f"its actions must be a Box action space with one dimension, got {action}"]
     if not np.all(np.isfinite(action.low) & np.isfinite(action.high)):
@@ -41,7 +43,7 @@ def _action_problems(action: spaces.Space[Any]) -> list[str]:
     return []
 
 
-def check_goal_space(observation: spaces.Space[Any], action: spaces.Space[Any] | None = None) -> spaces.Dict:
+def check_goal_space(observation: Space, action: Space | None = None) -> spaces.Dict:
     """Return the observation space if it is that of a goal environment.
 
     :param action: the action space, to look at that too

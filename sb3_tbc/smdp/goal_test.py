@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from copy import deepcopy
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.arrays import BoolArray, FloatArray
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
 from sb3_tbc.errors import ConfigError, NonFiniteError
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
 from sb3_tbc.smdp.hindsight import GoalTest
@@ -28,7 +26,7 @@ def goal_test_of(venv: VecEnv) -> GoalTest:
     ``compute_terminated`` a goal ends the task where its reward is as high as that of the goal itself.
     """
 
-    def ask(method: str, achieved: FloatArray, desired: FloatArray) -> NDArray[Any]:
+    def ask(method: str, achieved: FloatArray, desired: FloatArray) -> AnyArray:
         answer = np.asarray(venv.env_method(method, achieved, desired, {}, indices=[0])[0])
         if answer.shape != (len(achieved),):
             raise ConfigError(
@@ -97,7 +95,7 @@ class EpisodeJudge:
         self._venv = venv
         self._warned = False
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Plain:
         """For copies, which ask their own environments."""
         return {name: value for name, value in self.__dict__.items() if name != "goal_test"}
 
@@ -106,7 +104,7 @@ class EpisodeJudge:
         """The task's own reward and end for any goals."""
         return goal_test_of(self._venv)
 
-    def succeeded(self, info: Mapping[str, Any]) -> bool:
+    def succeeded(self, info: PlainMapping) -> bool:
         """What the task says of an episode's last step, else what its functions say of the last goals.
 
         :param info: of the step that ended the episode

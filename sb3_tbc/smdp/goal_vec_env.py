@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import gymnasium as gym
-from numpy.typing import NDArray
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
+from sb3_tbc.aliases import Env, Plain
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.smdp.faults import fault
 from sb3_tbc.smdp.goal_spaces import goal_space_problems
 from sb3_tbc.smdp.spaces import GoalObservation
@@ -21,11 +21,11 @@ class RunningEpisode(NamedTuple):
     """What it takes to live through an unfinished episode again."""
 
     seed: int | None  # that the reset was given, or
-    generator: dict[str, Any]  # the state of the task's random generator before the reset
-    actions: list[NDArray[Any]]  # taken since
+    generator: Plain  # the state of the task's random generator before the reset
+    actions: list[AnyArray]  # taken since
 
 
-def in_goal_vec_env(env: gym.Env[Any, Any] | VecEnv) -> gym.Env[Any, Any] | VecEnv:
+def in_goal_vec_env(env: Env | VecEnv) -> Env | VecEnv:
     """A single goal environment, monitored, as a :class:`GoalVecEnv`; anything else as it is."""
     if isinstance(env, VecEnv) or goal_space_problems(env.observation_space):
         return env
@@ -42,7 +42,7 @@ class GoalVecEnv(DummyVecEnv):
     same state if all their randomness comes from ``np_random``, as Gymnasium asks for.
     """
 
-    def __init__(self, env_fns: list[Callable[[], gym.Env[Any, Any]]]) -> None:
+    def __init__(self, env_fns: list[Callable[[], Env]]) -> None:
         super().__init__(env_fns)
         self.running = [RunningEpisode(None, {}, []) for _ in self.envs]
 
@@ -77,7 +77,7 @@ class GoalVecEnv(DummyVecEnv):
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step every environment and reset those whose episode is over."""
-        infos: list[dict[str, Any]] = []
+        infos: list[Plain] = []
         for index, env in enumerate(self.envs):
             action = self.actions[index]
             try:

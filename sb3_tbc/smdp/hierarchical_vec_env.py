@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices
+from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.errors import HierarchyError
 from sb3_tbc.smdp.episode_limit import (
     ANNOUNCE,
@@ -51,11 +51,11 @@ class HierarchicalStep(NamedTuple):
 
     observations: FloatArray  # (n_envs, low_dim), the low level's, of the next options where windows ended
     window_over: BoolArray  # (n_envs,)
-    actions: NDArray[Any]  # (n_envs, action_dim), in the task's units
+    actions: AnyArray  # (n_envs, action_dim), in the task's units
     task_observations: GoalObservation  # the task's, after automatic resets
     task_rewards: FloatArray  # (n_envs,), the task's
     episode_over: BoolArray  # (n_envs,)
-    infos: list[dict[str, Any]]  # the task's; "option" where a window ended
+    infos: list[Plain]  # the task's; "option" where a window ended
     rewards: FloatArray  # (n_envs,), the low level's: 1 where a window ended with its subgoal reached
     episodes: dict[int, Episode]  # those that ended, by environment
 
@@ -99,7 +99,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self._task_can_tell = ends_early and can_tell(venv, layout.subgoals)
         self.judge = EpisodeJudge(venv)
         self._started = False
-        self._given: NDArray[Any] = np.zeros(0)  # what step_async was given
+        self._given: AnyArray = np.zeros(0)  # what step_async was given
 
     def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
         sizes = {key: width(space, key) for key in GOAL_KEYS}
@@ -132,7 +132,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         recorded = {f"recorder.{name}": array for name, array in self._recorder.get_state().items()}
         return {**recorded, **{f"clock.{name}": getattr(self.clock, name).copy() for name in self.clock.fields}}
 
-    def set_state(self, state: Mapping[str, NDArray[Any]], observation: GoalObservation) -> FloatArray:
+    def set_state(self, state: Mapping[str, AnyArray], observation: GoalObservation) -> FloatArray:
         """Take over what :meth:`get_state` gave, and go on from there.
 
         :param observation: what the environments show now
@@ -159,7 +159,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         """
         return self._advance(self.unit.unscale(unit_actions), unit_actions, states, next_states)
 
-    def step_async(self, actions: NDArray[Any]) -> None:
+    def step_async(self, actions: AnyArray) -> None:
         """Step with actions in the environment's units, as SB3 does it."""
         self._given = actions
 
@@ -174,7 +174,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
 
     def _advance(
         self,
-        actions: NDArray[Any],
+        actions: AnyArray,
         unit: FloatArray,
         states: FloatArray | None,
         next_states: FloatArray | None,
@@ -229,9 +229,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
             over &= ~late
         return over
 
-    def _before_reset(
-        self, observation: GoalObservation, dones: BoolArray, infos: list[dict[str, Any]]
-    ) -> GoalObservation:
+    def _before_reset(self, observation: GoalObservation, dones: BoolArray, infos: list[Plain]) -> GoalObservation:
         """What the step led to: SB3 hides the last observation of an episode in ``info``."""
         if not np.count_nonzero(dones):
             return observation
@@ -241,9 +239,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
                 seen[key][index] = infos[index]["terminal_observation"][key]
         return seen
 
-    def _close_options(
-        self, where: Indices, seen: GoalObservation, dones: BoolArray, infos: list[dict[str, Any]]
-    ) -> FloatArray:
+    def _close_options(self, where: Indices, seen: GoalObservation, dones: BoolArray, infos: list[Plain]) -> FloatArray:
         """Record the options that end; the low level's reward of each."""
         here = {key: seen[key][where] for key in GOAL_KEYS}
         reached = self.clock.reached(here, where)
@@ -257,7 +253,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         return rewards
 
     def _next_options(
-        self, where: Indices, observation: GoalObservation, dones: BoolArray, infos: list[dict[str, Any]]
+        self, where: Indices, observation: GoalObservation, dones: BoolArray, infos: list[Plain]
     ) -> dict[int, Episode]:
         """Finish episodes and begin options."""
         over = where[dones[where]]
@@ -268,7 +264,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self._begin_options(where, observation)
         return episodes
 
-    def _finish_episode(self, index: int, info: dict[str, Any]) -> Episode:
+    def _finish_episode(self, index: int, info: Plain) -> Episode:
         truncated, exhausted = info.get("TimeLimit.truncated", False), info.get(BUDGET_EXHAUSTED, False)
         success = info["is_success"] = self.judge.succeeded(info)
         return self._recorder.finish(index, not truncated, success and not exhausted, bool(exhausted))
@@ -308,7 +304,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
 CUT_OFF = (TerminationReason.EPISODE_END.value, TerminationReason.EVENT.value)
 
 
-def _tell_low_level(where: Indices, last: FloatArray, infos: list[dict[str, Any]]) -> None:
+def _tell_low_level(where: Indices, last: FloatArray, infos: list[Plain]) -> None:
     """Say in ``infos`` how windows ended, as SB3's algorithms expect to be told of episodes."""
     for index in where:
         cut = infos[index]["option"]["reason"] in CUT_OFF

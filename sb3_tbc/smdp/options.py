@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import BoolArray, FloatArray, Indices
 from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
@@ -109,7 +110,7 @@ class Option(NamedTuple):
     reached: bool
     reason: TerminationReason
 
-    def as_info(self) -> dict[str, Any]:
+    def as_info(self) -> Plain:
         """The trace that ``info["option"]`` carries, plain data."""
         return {
             "subgoal": self.subgoal.copy(),

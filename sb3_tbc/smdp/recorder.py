@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import AnyArray, Arrays, FloatArray
 from sb3_tbc.smdp.options import Episode, Option, TerminationReason
 from sb3_tbc.smdp.spaces import GoalObservation
 
@@ -74,7 +74,7 @@ class EpisodeRecorder:
             budget_exhausted=budget_exhausted,
         )
 
-    def get_state(self) -> dict[str, NDArray[Any]]:
+    def get_state(self) -> Arrays:
         """What was recorded of the running episodes, as plain arrays."""
         rows = int(self.steps.max()) + 1
         held = {name: array[:, :rows].copy() for name, array in self._data.items()}
@@ -86,7 +86,7 @@ class EpisodeRecorder:
         packed = np.array(options, dtype=np.float64).reshape(len(options), -1 if options else 0)
         return {**held, "steps": self.steps.copy(), "rewards": self._rewards[:, :rows].copy(), "options": packed}
 
-    def set_state(self, state: Mapping[str, NDArray[Any]]) -> None:
+    def set_state(self, state: Mapping[str, AnyArray]) -> None:
         """Take over what :meth:`get_state` gave."""
         self.steps[:] = state["steps"]
         rows = state["rewards"].shape[1]

@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.arrays import FloatArray as FloatArray
 
-GoalObservation = Mapping[str, NDArray[Any]]
+GoalObservation = Mapping[str, AnyArray]
 """A goal environment's observation: ``observation``, ``achieved_goal``, ``desired_goal``, single or batched."""
 
 

@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.tbc_hrl.plain import NotPlainError, decode
@@ -46,7 +47,7 @@ def read_bytes(path: str | Path | io.BufferedIOBase) -> bytes:
         raise ConfigError(f"cannot read {file}: {one_line(error)}") from error
 
 
-def read_data(content: bytes, name: str) -> dict[str, Any]:
+def read_data(content: bytes, name: str) -> Plain:
     """The tables ``data`` and, under its name, ``plain.json`` of an agent, after a look at the whole file.
 
     :param content: of the file
@@ -97,7 +98,7 @@ def _check_weights(content: bytes, name: str) -> None:
             raise ConfigError(f"{name} would unpack to far more than its {len(content)} bytes; no agent does")
 
 
-def _table(archive: zipfile.ZipFile, member: str, name: str) -> dict[str, Any]:
+def _table(archive: zipfile.ZipFile, member: str, name: str) -> Plain:
     if archive.getinfo(member).file_size > MAX_DATA:
         raise ConfigError(f"{name}: {member} has more than {MAX_DATA} bytes")
     table = json.loads(archive.read(member))
@@ -106,12 +107,12 @@ def _table(archive: zipfile.ZipFile, member: str, name: str) -> dict[str, Any]:
     return table
 
 
-def pickled_keys(data: dict[str, Any]) -> list[str]:
+def pickled_keys(data: Plain) -> list[str]:
     """The entries of ``data`` that SB3 would unpickle."""
     return [key for key, value in data.items() if isinstance(value, dict) and PICKLED in value]
 
 
-def unpickled(data: dict[str, Any], name: str, given: dict[str, Any], has_env: bool) -> dict[str, Any]:
+def unpickled(data: Plain, name: str, given: Plain, has_env: bool) -> Plain:
     """For SB3's ``custom_objects``: a plain value for every entry that it would unpickle otherwise.
 
     :param data: as :func:`read_data` gave it
@@ -124,7 +125,7 @@ def unpickled(data: dict[str, Any], name: str, given: dict[str, Any], has_env: b
     plain = data.get(PLAIN_DATA, {})
     if "env" in data:
         raise UntrustedError(f"{name} brings an environment along; {CURE}")
-    values: dict[str, Any] = {}
+    values: Plain = {}
     for key in pickled_keys(data):
         if key in given:
             continue
@@ -151,7 +152,7 @@ def _has_form(data: Any) -> bool:
 CURE = "if you trust where it comes from, load it with trust=True (commands: --trust)"
 
 
-def with_plain(content: bytes, plain: dict[str, Any]) -> bytes:
+def with_plain(content: bytes, plain: Plain) -> bytes:
     """The file with the table ``plain.json`` added."""
     buffer = io.BytesIO(content)
     with zipfile.ZipFile(buffer, "a") as archive:

@@ -11,7 +11,7 @@ import dataclasses
 import inspect
 import os
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar
 
@@ -19,6 +19,7 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.settings import Range, SettingError, Settings, default_of, hints
 from sb3_tbc.smdp.spaces import SubgoalSpace
 from sb3_tbc.tbc_hrl.config import AgentConfig, FlatConfig, HighConfig, LowConfig
@@ -49,7 +50,7 @@ class SB3Arguments(Settings):
         check_device(self.device)
 
     @classmethod
-    def taken_from(cls: type[SelfArguments], arguments: Mapping[str, Any]) -> tuple[SelfArguments, dict[str, Any]]:
+    def taken_from(cls: type[SelfArguments], arguments: PlainMapping) -> tuple[SelfArguments, Plain]:
         """Stable-Baselines3's arguments among all, checked, and the others as they are."""
         own = {name: value for name, value in arguments.items() if name in hints(cls)}
         others = {name: value for name, value in arguments.items() if name not in own}
@@ -87,8 +88,8 @@ class TBCArguments(AgentConfig, HierarchyArguments):
 
     policy: str | type[BasePolicy]
     env: GymEnv | str | None
-    high: HighConfig | Mapping[str, Any] | None = field(default=None, kw_only=True)
-    low: LowConfig | Mapping[str, Any] | None = field(default=None, kw_only=True)
+    high: HighConfig | PlainMapping | None = field(default=None, kw_only=True)
+    low: LowConfig | PlainMapping | None = field(default=None, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -126,5 +127,5 @@ def _parameter(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
     """A field as a keyword argument; a section may be given as a mapping, and its default is "as it is"."""
     default = default_of(field)
     if isinstance(default, Settings):
-        kind, default = kind | Mapping[str, Any] | None, None
+        kind, default = kind | PlainMapping | None, None
     return inspect.Parameter(field.name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)

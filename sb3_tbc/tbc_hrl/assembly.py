@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch as th
 from gymnasium import spaces
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
@@ -179,7 +180,7 @@ def _make_level(
     config: TBCConfig,
     level: LevelConfig,
     ends: LevelSpaces,
-    policy_kwargs: dict[str, Any],
+    policy_kwargs: Plain,
     seed: int,
     device: th.device,
     bounds: ValueBounds | None,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices
+from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep, HierarchicalVecEnv, Proposal, Schedule
 from sb3_tbc.smdp.hindsight import (
@@ -117,7 +116,7 @@ class Collector(TwoLevelRunner):
         """Live options, running episodes and memory, as plain arrays."""
         return {**self.env.get_state(), "membrane": self.membrane, "observation": self.observation}
 
-    def set_state(self, state: Mapping[str, NDArray[Any]], observation: GoalObservation) -> bool:
+    def set_state(self, state: Mapping[str, AnyArray], observation: GoalObservation) -> bool:
         """Take over what :meth:`get_state` gave; False if what the environments show does not belong to it.
 
         :param observation: what the environments show now

@@ -13,6 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
 from stable_baselines3.common.utils import safe_mean
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.hindsight import HighLevelSteps
 from sb3_tbc.smdp.options import Episode
 
@@ -26,7 +27,7 @@ class EpisodeDiagnostics:
     def add(self, episode: Episode, steps: HighLevelSteps) -> None:
         """Take in a finished episode and the transitions made of it."""
         options = episode.options
-        values: dict[str, Any] = {
+        values: Plain = {
             "option/subgoal_success": np.mean([option.reached for option in options]),
             "option/time_budget": np.mean([option.time_budget for option in options]),
             "option/duration": np.mean([option.duration for option in options]),

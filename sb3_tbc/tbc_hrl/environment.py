@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.arrays import Arrays
 from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, width
 from sb3_tbc.tasks.layouts import layout_cure
@@ -48,7 +48,7 @@ def episode_length(env: VecEnv) -> int | None:
     return limit
 
 
-def check_sizes(space: spaces.Dict, batch: dict[str, NDArray[Any]]) -> None:
+def check_sizes(space: spaces.Dict, batch: Arrays) -> None:
     """Refuse observations of another size than an agent was trained on.
 
     :param space: the agent's observation space

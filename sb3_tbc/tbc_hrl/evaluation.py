@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from sb3_tbc.aliases import Env
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.goal_test import EpisodeJudge
 from sb3_tbc.smdp.options import Episode
@@ -45,7 +45,7 @@ Agent = TBCHRL | FlatSAC
 
 def evaluate_agent(
     model: Agent,
-    env: VecEnv | gym.Env[Any, Any],
+    env: VecEnv | Env,
     n_eval_episodes: int = 100,
     seed: int | None = None,
     deterministic: bool = True,
@@ -58,7 +58,7 @@ def evaluate_agent(
 
 def evaluate_flat(
     model: FlatSAC,
-    env: VecEnv | gym.Env[Any, Any],
+    env: VecEnv | Env,
     n_eval_episodes: int = 100,
     seed: int | None = None,
     deterministic: bool = True,
@@ -84,7 +84,7 @@ def evaluate_flat(
 
 def evaluate_hierarchical(
     model: TBCHRL,
-    env: VecEnv | gym.Env[Any, Any],
+    env: VecEnv | Env,
     n_eval_episodes: int = 100,
     seed: int | None = None,
     deterministic: bool = True,
@@ -111,7 +111,7 @@ def evaluate_hierarchical(
     return _columns(_run(runner, per_env), n_eval_episodes)
 
 
-def _vector(env: VecEnv | gym.Env[Any, Any], n_eval_episodes: int) -> VecEnv:
+def _vector(env: VecEnv | Env, n_eval_episodes: int) -> VecEnv:
     if n_eval_episodes < 1:
         raise ValueError(f"n_eval_episodes must be at least 1, got {n_eval_episodes}")
     return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])

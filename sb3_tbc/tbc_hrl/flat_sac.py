@@ -9,7 +9,6 @@ from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
@@ -23,6 +22,8 @@ from stable_baselines3.common.type_aliases import (
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.sac.policies import MultiInputPolicy
 
+from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.files import write_arrays
 from sb3_tbc.replay.both_levels import MORE
 from sb3_tbc.smdp.goal_spaces import check_goal_space
@@ -57,7 +58,7 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
         super().__init__(*args, **kwargs)
         self.event_goals = event_goals
 
-    def _sample_goals(self, batch_indices: NDArray[Any], env_indices: NDArray[Any]) -> NDArray[Any]:
+    def _sample_goals(self, batch_indices: AnyArray, env_indices: AnyArray) -> AnyArray:
         if not self.event_goals or self.env is None:
             return super()._sample_goals(batch_indices, env_indices)
         event = attribute_of(self.env, "subgoals").event
@@ -66,7 +67,7 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
         rows = (starts + ahead) % self.buffer_size
         happened = (self.next_observations["observation"][rows, env_indices[:, None], event] > 0.5) & (ahead < lengths)
         first = rows[np.arange(len(rows)), happened.argmax(axis=1)]
-        goals: NDArray[Any] = np.where(
+        goals: AnyArray = np.where(
             happened.any(axis=1, keepdims=True),
             self.next_observations["achieved_goal"][first, env_indices],
             self.observations["desired_goal"][batch_indices, env_indices],
@@ -74,7 +75,7 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
         return goals
 
     def _get_virtual_samples(
-        self, batch_indices: NDArray[Any], env_indices: NDArray[Any], env: VecNormalize | None = None
+        self, batch_indices: AnyArray, env_indices: AnyArray, env: VecNormalize | None = None
     ) -> DictReplayBufferSamples:
         samples = super()._get_virtual_samples(batch_indices, env_indices, env)
         if self.env is None:
@@ -109,7 +110,7 @@ class FlatSAC(PlainAlgorithm, SAC):
         self.settings = config.to_dict()
         self.gradient_ratio = config.gradient_ratio
         self._updated_at, self._owed = 0, 0.0
-        self._resumed: dict[str, Any] = {}
+        self._resumed: Plain = {}
         self.stop_requested = False
         by_event = config.goal_strategy == "event"
         super().__init__(
@@ -226,7 +227,7 @@ class FlatSAC(PlainAlgorithm, SAC):
         ``learn(..., reset_num_timesteps=False)`` as if it had never stopped, bit for bit.
         """
         buffer = self._her_buffer()
-        arrays: dict[str, Any] = {name: getattr(buffer, name) for name in ARRAYS}
+        arrays: Plain = {name: getattr(buffer, name) for name in ARRAYS}
         for part in ("observations", "next_observations"):
             arrays |= {f"{part}.{key}": array for key, array in getattr(buffer, part).items()}
         rows = buffer.buffer_size if buffer.full else buffer.pos

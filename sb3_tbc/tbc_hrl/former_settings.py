@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Mapping
 from typing import Any
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.settings import SettingError, Settings, hints, section_of
 
 FORMER_NAMES = {"high_settings": "high", "low_settings": "low"}
@@ -19,7 +20,7 @@ LEVEL_NAMES = ("actor_learning_rate", "batch_size", "buffer_size", "ent_coef", "
 """What Stable-Baselines3 takes at the top and an agent of two levels for each of them."""
 
 
-def check_top_names(given: Mapping[str, Any]) -> None:
+def check_top_names(given: PlainMapping) -> None:
     """Refuse a setting of a level where none is named.
 
     :raises SettingError: naming where it belongs
@@ -33,7 +34,7 @@ def check_top_names(given: Mapping[str, Any]) -> None:
             )
 
 
-def take_settings(attributes: dict[str, Any], config_class: type[Settings]) -> dict[str, Any]:
+def take_settings(attributes: Plain, config_class: type[Settings]) -> Plain:
     """Settings found among an agent's attributes, which are removed there.
 
     :param attributes: ``settings`` as :meth:`to_dict` gave them, and single ones by name, which replace them
@@ -42,7 +43,7 @@ def take_settings(attributes: dict[str, Any], config_class: type[Settings]) -> d
     """
     changed = {name: value for name, value in _unset(attributes).items() if name in LEVEL_NAMES}
     check_top_names(changed)
-    settings: dict[str, Any] = dict(attributes.pop("settings", {}))
+    settings: Plain = dict(attributes.pop("settings", {}))
     for former, name in FORMER_NAMES.items():
         if former in attributes:
             settings[name] = attributes.pop(former)
@@ -58,13 +59,13 @@ def take_settings(attributes: dict[str, Any], config_class: type[Settings]) -> d
     return settings
 
 
-def _unset(attributes: Mapping[str, Any]) -> dict[str, Any]:
+def _unset(attributes: PlainMapping) -> Plain:
     """Attributes without what Stable-Baselines3 itself keeps under a level's name."""
     own = {"learning_rate": 0.0, "policy_kwargs": {}}
     return {name: value for name, value in attributes.items() if name not in own or value != own[name]}
 
 
-def _drop_retired(settings: dict[str, Any], attributes: dict[str, Any]) -> None:
+def _drop_retired(settings: Plain, attributes: Plain) -> None:
     for name, harmless in RETIRED.items():
         section, _, key = name.rpartition(".")
         holder = settings.get(section) if section else attributes

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from stable_baselines3.common.utils import LinearSchedule
 from torch import nn
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.level.update import AVERAGE_DECAY
 from sb3_tbc.ndbc.stepping import StepRule
 from sb3_tbc.settings import Increasing, Prefixed, Range, SettingError, Settings
@@ -75,7 +76,7 @@ class PolicyConfig(Settings):
             object.__setattr__(self, "activation_fn", names[self.activation_fn])
         super().__post_init__()
 
-    def to_kwargs(self) -> dict[str, Any]:
+    def to_kwargs(self) -> Plain:
         """As keyword arguments of :class:`~sb3_tbc.level.policies.LevelPolicy`."""
         return {**self.to_dict(), "activation_fn": ACTIVATION_NAMES[str(self.activation_fn)]}
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Any
 
+from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.settings import SettingError
 
 CHANGEABLE = ("learning_rate", "batch_size", "gradient_ratio", "tau")
 """Settings that take effect with the next update; all others are built into the level."""
 
 
-class LiveSettings(Mapping[str, Any]):
+class LiveSettings(PlainMapping):
     """A level's settings; ``settings["learning_rate"] = 1e-4`` holds from the next update on.
 
     :param name: the level, ``"high"`` or ``"low"``
@@ -19,7 +20,7 @@ class LiveSettings(Mapping[str, Any]):
     :param change: takes a setting's name and new value
     """
 
-    def __init__(self, name: str, values: Mapping[str, Any], change: Callable[[str, Any], None]) -> None:
+    def __init__(self, name: str, values: PlainMapping, change: Callable[[str, Any], None]) -> None:
         self._name, self._values, self._change = name, values, change
 
     def __getitem__(self, key: str) -> Any:

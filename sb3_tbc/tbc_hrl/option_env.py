@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import AnyArray, FloatArray
 from sb3_tbc.smdp.episode_limit import ANNOUNCE, LastWindow, with_episode_limit
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
 from sb3_tbc.smdp.options import OptionClock
@@ -68,7 +69,7 @@ class OptionEnv(VecEnvWrapper):
         self._forget(np.arange(self.num_envs))
         return self.policy.views.high(self._seen)
 
-    def step_async(self, actions: NDArray[Any]) -> None:
+    def step_async(self, actions: AnyArray) -> None:
         """Take the next options, in unit coordinates; what lies outside [-1, 1] is clipped."""
         self._actions = np.clip(np.asarray(actions, dtype=np.float64), -1.0, 1.0)
 
@@ -77,7 +78,7 @@ class OptionEnv(VecEnvWrapper):
         self._begin()
         rewards: list[list[float]] = [[] for _ in range(self.num_envs)]
         dones = np.zeros(self.num_envs, dtype=bool)
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos: list[Plain] = [{} for _ in range(self.num_envs)]
         live = np.arange(self.num_envs)
         while len(live):
             for index, action in zip(live, self._act(live), strict=True):
@@ -109,17 +110,17 @@ class OptionEnv(VecEnvWrapper):
             window = LastWindow(steps, self.policy.views.subgoals, subgoal, math.ceil(rules.dt_min))
             self.venv.env_method(ANNOUNCE, window, indices=[int(index)])
 
-    def _act(self, live: Indices) -> NDArray[Any]:
+    def _act(self, live: Indices) -> AnyArray:
         """The low level's actions in the environments whose option is running."""
         policy, seen = self.policy, {key: self._seen[key][live] for key in GOAL_KEYS}
         remaining = policy.rules.remaining(self.clock.time_left[live])
         observation = policy.views.low(seen, self.clock.subgoal[live], remaining)
         unit, after = policy.actor.act(observation, self._membrane[live], self.deterministic, self.rng)
         self._membrane[live] = after
-        actions: NDArray[Any] = policy.unit.unscale(unit)
+        actions: AnyArray = policy.unit.unscale(unit)
         return actions
 
-    def _step_one(self, index: int, action: NDArray[Any]) -> tuple[float, bool, dict[str, Any]]:
+    def _step_one(self, index: int, action: AnyArray) -> tuple[float, bool, Plain]:
         """One step of one environment: its reward, whether its episode is over, its info."""
         observation, reward, terminated, truncated, info = self.venv.env_method("step", action, indices=[index])[0]
         for key in GOAL_KEYS:
@@ -127,7 +128,7 @@ class OptionEnv(VecEnvWrapper):
         over = bool(terminated or truncated)
         return float(reward), over, {**info, "TimeLimit.truncated": over and not terminated}
 
-    def _close(self, index: int, rewards: list[float], over: bool, info: dict[str, Any]) -> float:
+    def _close(self, index: int, rewards: list[float], over: bool, info: Plain) -> float:
         """Reward of the option that ended; begins a new episode where that is over, too."""
         reward, duration = self.agent.high_reward, np.array([len(rewards)])
         reached = bool(self.clock.reached({key: self._seen[key][[index]] for key in GOAL_KEYS}, np.array([index]))[0])
@@ -142,7 +143,7 @@ class OptionEnv(VecEnvWrapper):
             self._restart(index, info)
         return float(value)
 
-    def _restart(self, index: int, info: dict[str, Any]) -> None:
+    def _restart(self, index: int, info: Plain) -> None:
         last = {key: self._seen[key][[index]] for key in GOAL_KEYS}
         info["terminal_observation"] = self.policy.views.high(last)[0]
         observation, self.reset_infos[index] = self.venv.env_method("reset", indices=[index])[0]

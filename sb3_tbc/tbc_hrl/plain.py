@@ -24,6 +24,7 @@ from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from torch import nn
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
 SCHEDULES = (ConstantSchedule, FloatSchedule, LinearSchedule)
@@ -148,7 +149,7 @@ def _is_own_data(kind: type) -> bool:
     return kind.__module__.startswith("sb3_tbc.") and dataclasses.is_dataclass(kind)
 
 
-def _fields(value: Any) -> dict[str, Any]:
+def _fields(value: Any) -> Plain:
     if hasattr(value, "to_dict"):  # settings: written by name, checked when read
         return dict(value.to_dict())
     return dict(vars(value))
@@ -171,7 +172,7 @@ def _object(**parts: Any) -> Any:
 # --------------------------------------------------------------------------------------------- what there is
 
 
-def _array(value: Any) -> dict[str, Any]:
+def _array(value: Any) -> Plain:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
         raise NotPlainError(f"an array of {array.dtype} has no plain form")
@@ -191,7 +192,7 @@ def _read_scalar(**parts: Any) -> Any:
     return _read_array(**parts)[()]
 
 
-def _write_box(box: spaces.Box) -> dict[str, Any]:
+def _write_box(box: spaces.Box) -> Plain:
     return {"low": encode(box.low), "high": encode(box.high)}
 
 
@@ -199,17 +200,17 @@ def _read_box(low: Any, high: Any) -> spaces.Box:
     return spaces.Box(low, high, dtype=low.dtype)
 
 
-def _write_dict(table: dict[Any, Any]) -> dict[str, Any]:
+def _write_dict(table: dict[Any, Any]) -> Plain:
     if not all(isinstance(key, str) and key != PLAIN for key in table):
         return {PLAIN: "pairs", "pairs": [[encode(key), encode(item)] for key, item in table.items()]}
     return {key: encode(item) for key, item in table.items()}
 
 
-def _write_partial(call: partial[Any]) -> dict[str, Any]:
+def _write_partial(call: partial[Any]) -> Plain:
     return {"call": encode(call.func), "arguments": encode(list(call.args)), "named": encode(dict(call.keywords))}
 
 
-def _read_schedule(name: str, fields: dict[str, Any]) -> Any:
+def _read_schedule(name: str, fields: Plain) -> Any:
     kind = next((kind for kind in SCHEDULES if kind.__name__ == name), None)
     if kind is None:
         raise NotPlainError(f"unknown schedule {name!r}")
@@ -261,7 +262,7 @@ READERS: dict[str, Callable[..., Any]] = {
 }
 
 
-def _read_partial(call: Any, arguments: list[Any], named: dict[str, Any]) -> partial[Any]:
+def _read_partial(call: Any, arguments: list[Any], named: Plain) -> partial[Any]:
     if not isinstance(call, FunctionType) or not call.__module__.startswith("sb3_tbc.tasks."):
         raise NotPlainError("only functions of tasks can have arguments filled in")
     return partial(call, *arguments, **named)

@@ -10,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_tbc.arrays import BoolArray, FloatArray
+from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray
 from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import NDBCActor
@@ -89,11 +89,11 @@ class TBCPolicy(BasePolicy):
 
     def predict(
         self,
-        observation: NDArray[Any] | dict[str, NDArray[Any]],
-        state: tuple[NDArray[Any], ...] | None = None,
-        episode_start: NDArray[Any] | None = None,
+        observation: AnyArray | Arrays,
+        state: tuple[AnyArray, ...] | None = None,
+        episode_start: AnyArray | None = None,
         deterministic: bool = False,
-    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+    ) -> tuple[AnyArray, tuple[AnyArray, ...] | None]:
         """Primitive actions for one observation or a batch of them.
 
         Pass the returned state back in with the next observation: it holds the live subgoal, its time budget and the
@@ -119,9 +119,9 @@ class TBCPolicy(BasePolicy):
             self._name_non_finite(seen, membrane, unit, clock.elapsed)
         actions = self.unit.unscale(unit)
         clock.tick()
-        return (actions[0] if single else actions), cast("tuple[NDArray[Any], ...]", _packed(clock, membrane))
+        return (actions[0] if single else actions), cast("tuple[AnyArray, ...]", _packed(clock, membrane))
 
-    def _unpacked(self, n: int, state: tuple[NDArray[Any], ...] | None) -> tuple[OptionClock, FloatArray]:
+    def _unpacked(self, n: int, state: tuple[AnyArray, ...] | None) -> tuple[OptionClock, FloatArray]:
         """Clock and memory of a state, copied."""
         clock = OptionClock(n, self.views.subgoals, self.rules)
         if state is None:
@@ -131,9 +131,7 @@ class TBCPolicy(BasePolicy):
             getattr(clock, name)[:] = getattr(given, name)
         return clock, np.array(given.membrane, dtype=np.float32)
 
-    def _begin_options(
-        self, clock: OptionClock, batch: dict[str, NDArray[Any]], starts: BoolArray, deterministic: bool
-    ) -> BoolArray:
+    def _begin_options(self, clock: OptionClock, batch: Arrays, starts: BoolArray, deterministic: bool) -> BoolArray:
         """Replace the options that are over, in place; which they are."""
         over = starts | clock.ended(batch)
         clock.begin_episode(np.flatnonzero(starts))
@@ -156,7 +154,7 @@ class TBCPolicy(BasePolicy):
             check_finite(actor.net.wiring, seen[one], membrane[one], unit[one], "low", step)
         raise NonFiniteError(f"low level, step {step}: action {unit[row].tolist()} for inputs {seen[row].tolist()}")
 
-    def _as_batch(self, observation: Any) -> tuple[dict[str, NDArray[Any]], bool]:
+    def _as_batch(self, observation: Any) -> tuple[Arrays, bool]:
         if not isinstance(observation, dict) or any(key not in observation for key in GOAL_KEYS):
             found = sorted(observation) if isinstance(observation, dict) else type(observation).__name__
             raise ValueError(f"predict needs a goal observation with the keys {sorted(GOAL_KEYS)}, got {found}")

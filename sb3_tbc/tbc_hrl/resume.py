@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.arrays import Arrays
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import AnyArray, Arrays
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import NDBCActor
 from sb3_tbc.replay.both_levels import Replay
@@ -86,7 +86,7 @@ def get_state(learning: LearningState) -> Arrays:
     return {**arrays, "plain": np.array(json.dumps(plain))}
 
 
-def set_state(learning: LearningState, state: Mapping[str, NDArray[Any]]) -> bool:
+def set_state(learning: LearningState, state: Mapping[str, AnyArray]) -> bool:
     """Go on where :func:`get_state` was taken; False if the state is of another moment, and nothing was changed.
 
     The log says so: weights and replay of different moments make a run that goes on, but not the one that was saved.
@@ -117,7 +117,7 @@ def set_state(learning: LearningState, state: Mapping[str, NDArray[Any]]) -> boo
     return True
 
 
-def _relive(collector: Collector, plain: Mapping[str, Any], state: Mapping[str, NDArray[Any]]) -> None:
+def _relive(collector: Collector, plain: PlainMapping, state: Mapping[str, AnyArray]) -> None:
     venv, starts = collector.env.venv, plain.get("episodes", [])
     if not isinstance(venv, GoalVecEnv) or len(starts) != venv.num_envs:
         logger.warning(NOT_KNOWN)
@@ -129,13 +129,13 @@ def _relive(collector: Collector, plain: Mapping[str, Any], state: Mapping[str, 
         collector.reset()
 
 
-def _running(venv: GoalVecEnv) -> tuple[list[dict[str, Any]], Arrays]:
+def _running(venv: GoalVecEnv) -> tuple[list[Plain], Arrays]:
     """How the running episodes began, and the actions taken since."""
     starts = [{"seed": episode.seed, "generator": episode.generator} for episode in venv.running]
     return starts, {f"actions.{i}": np.array(episode.actions) for i, episode in enumerate(venv.running)}
 
 
-def _episodes(starts: list[dict[str, Any]], state: Mapping[str, NDArray[Any]]) -> list[RunningEpisode]:
+def _episodes(starts: list[Plain], state: Mapping[str, AnyArray]) -> list[RunningEpisode]:
     return [RunningEpisode(**start, actions=list(state[f"actions.{i}"])) for i, start in enumerate(starts)]
 
 
@@ -145,7 +145,7 @@ def _episodes(starts: list[dict[str, Any]], state: Mapping[str, NDArray[Any]]) -
 def get_flat_state(model: OffPolicyAlgorithm) -> Arrays:
     """As :func:`get_state`. SB3's SAC draws from the generators of torch and NumPy that all code shares."""
     _, keys, *rest = np.random.get_state()  # noqa: NPY002 (SB3 draws from it)
-    plain: dict[str, Any] = {
+    plain: Plain = {
         "timesteps": int(model.num_timesteps),
         "numpy": rest,
         "action_space": model.action_space.np_random.bit_generator.state,
@@ -157,14 +157,14 @@ def get_flat_state(model: OffPolicyAlgorithm) -> Arrays:
     return {**arrays, "plain": np.array(json.dumps(plain))}
 
 
-def can_go_on(model: OffPolicyAlgorithm, state: Mapping[str, NDArray[Any]]) -> bool:
+def can_go_on(model: OffPolicyAlgorithm, state: Mapping[str, AnyArray]) -> bool:
     """Whether a saved run's episodes can be gone on with."""
     plain = json.loads(str(state["plain"])) if "plain" in state else {}
     known = isinstance(model.env, GoalVecEnv) and len(plain.get("episodes", ())) == model.n_envs
     return known and plain["timesteps"] == model.num_timesteps
 
 
-def set_flat_state(model: OffPolicyAlgorithm, env: VecEnv, state: Mapping[str, NDArray[Any]]) -> bool:
+def set_flat_state(model: OffPolicyAlgorithm, env: VecEnv, state: Mapping[str, AnyArray]) -> bool:
     """Go on where :func:`get_flat_state` was taken; False if living through the saved episodes led elsewhere.
 
     Those are then over, and new ones begin, which the log says; as it does where nothing is known of them.

@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.files import save_atomic
 from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
@@ -45,7 +46,7 @@ class PlainAlgorithm(BaseAlgorithm):
         target = target if target.suffix else target.with_suffix(".zip")
         save_atomic(lambda name: pathlib.Path(name).write_bytes(content), target)
 
-    def _plain(self, content: bytes) -> dict[str, Any]:
+    def _plain(self, content: bytes) -> Plain:
         """What SB3 has pickled, as far as it has a plain form; the rest needs ``trust=True`` when it is loaded."""
         plain = {}
         for key in pickled_keys(read_data(content, type(self).__name__)):
@@ -61,7 +62,7 @@ class PlainAlgorithm(BaseAlgorithm):
         path: str | pathlib.Path | io.BufferedIOBase,
         env: GymEnv | None = None,
         device: th.device | str = "auto",
-        custom_objects: dict[str, Any] | None = None,
+        custom_objects: Plain | None = None,
         print_system_info: bool = False,
         force_reset: bool = True,
         trust: bool = False,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.settings import hints
 from sb3_tbc.smdp.bounds import RewardRange
@@ -99,7 +100,7 @@ class TBCHRL(TwoLevelSaving):
         self._burst_due = False  # an episode was stored since the last updates
         self.stop_requested = False
         self.collector: Collector | None = None
-        self._resumed: dict[str, Any] = {}
+        self._resumed: Plain = {}
         if others._init_setup_model:
             self._setup_model()
 
@@ -292,7 +293,7 @@ class TBCHRL(TwoLevelSaving):
         callback.on_training_end()
         return self
 
-    def _collect_from(self, env: VecEnv, anew: bool, resumed: Mapping[str, Any]) -> Collector:
+    def _collect_from(self, env: VecEnv, anew: bool, resumed: PlainMapping) -> Collector:
         """What acts in the environments: the one that did so before, unless they begin new episodes.
 
         :param anew: they were just reset
@@ -354,7 +355,7 @@ class TBCHRL(TwoLevelSaving):
             self._burst_due = True
             self.diagnostics.add(episode, self.store.add(episode, goal_test))
 
-    def _as_sb3_names(self, step: HierarchicalStep) -> dict[str, Any]:
+    def _as_sb3_names(self, step: HierarchicalStep) -> Plain:
         """What SB3's algorithms show their callbacks of a step: the task's side of it, episodes and not windows."""
         return {
             "self": self, "env": self.env, "replay_buffer": self.replay_buffer, "actions": step.actions,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.tbc_hrl import resume
@@ -30,7 +31,7 @@ class TwoLevelSaving(PlainAlgorithm):
     rng: np.random.Generator
     diagnostics: EpisodeDiagnostics
     collector: Collector | None
-    _resumed: dict[str, Any]
+    _resumed: Plain
 
     def _make_replay(self, high_spaces: LevelSpaces, low_spaces: LevelSpaces, high_seed: int, low_seed: int) -> None:
         """Empty replay buffers for both levels, and what fills them."""

@@ -10,10 +10,11 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch as th
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
@@ -35,7 +36,7 @@ ASKED = (
     *("first_seed", "objective", "across_seeds", "threshold", "eval_freq", "n_eval_episodes", "n_final_episodes"),
 )
 """Options that decide what trials are compared; an existing study has them already, and others are refused."""
-DEFAULTS: dict[str, Any] = {
+DEFAULTS: Plain = {
     "n_seeds": 2,
     "first_seed": 0,
     "objective": "auc",
@@ -101,7 +102,7 @@ def build_parser() -> Parser:
 # --------------------------------------------------------------------------------------------- a new study
 
 
-def asked(args: argparse.Namespace) -> dict[str, Any]:
+def asked(args: argparse.Namespace) -> Plain:
     """The options given that decide what is compared, as plain data."""
     given = {name: getattr(args, name) for name in ASKED if getattr(args, name) is not None}
     return {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
@@ -144,7 +145,7 @@ def new_settings(args: argparse.Namespace) -> StudySettings:
     )
 
 
-def baselines(args: argparse.Namespace, task: str, env_id: str, fixed: dict[str, Any]) -> dict[str, RunConfig]:
+def baselines(args: argparse.Namespace, task: str, env_id: str, fixed: Plain) -> dict[str, RunConfig]:
     """The configurations of the first trials: the paper's row and the shipped tuned one, or what ``train`` would run.
 
     :raises ConfigError: if one of them cannot be built
@@ -171,7 +172,7 @@ def _checked(run: RunConfig, env_id: str) -> RunConfig:
         action_dim = int(math.prod(env.action_space.shape or (1,)))
         run = complete(run, action_dim)
         hierarchical = issubclass(algorithm(run.algo), TBCHRL)
-        small: dict[str, Any] = {"buffer_size": 1000}
+        small: Plain = {"buffer_size": 1000}
         small = {level: small for level in ("low", "high")} if hierarchical else small
         build_model(replace(run, model=merge(run.model, small)), env, 0)
     finally:

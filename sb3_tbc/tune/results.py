@@ -15,6 +15,7 @@ import yaml
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.tune.pruning import SEED_VALUES
@@ -42,9 +43,9 @@ def find_trial(study: Study, which: str) -> FrozenTrial:
     return trial
 
 
-def difference(base: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+def difference(base: PlainMapping, other: PlainMapping) -> Plain:
     """What must be laid over ``base`` to get ``other``, which has at least the same keys."""
-    found: dict[str, Any] = {}
+    found: Plain = {}
     for key, value in other.items():
         old = base.get(key)
         if isinstance(old, Mapping) and isinstance(value, Mapping):
@@ -55,7 +56,7 @@ def difference(base: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, A
     return found
 
 
-def as_section(run: RunConfig) -> dict[str, Any]:
+def as_section(run: RunConfig) -> Plain:
     """A configuration as a section of ``zoo_configs``."""
     data = run.to_dict()
     return {**{key: data[key] for key in ("n_timesteps", "n_envs", "env_kwargs")}, **data["model"]}

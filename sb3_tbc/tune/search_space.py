@@ -12,13 +12,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, Protocol
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.reading import read_yaml
 from sb3_tbc.tbc_hrl.config import CircuitConfig
 from sb3_tbc.zoo.config import RunConfig, merge
 from sb3_tbc.zoo.schema import CONFIG_CLASSES, RUN, coerce, validate
 
-Values = dict[str, Any]
+Values = Plain
 """Parameter name -> value, as a trial holds it."""
 
 SCHEDULE = "learning_rate_schedule"
@@ -63,7 +64,7 @@ class Parameter:
     log: bool = False
     step: float | None = None
     choices: tuple[Any, ...] = ()
-    sets: Mapping[Any, Mapping[str, Any]] = field(default_factory=dict)
+    sets: Mapping[Any, PlainMapping] = field(default_factory=dict)
     when: tuple[str, Any] | None = None
 
     @property
@@ -139,9 +140,9 @@ def _default(algo: str, key: str) -> Any:
     return value
 
 
-def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+def nested(settings: PlainMapping) -> Plain:
     """``{"low.tau": 1}`` as ``{"low": {"tau": 1}}``."""
-    result: dict[str, Any] = {}
+    result: Plain = {}
     for key, value in settings.items():
         for name in reversed(key.split(".")):
             value = {name: value}
@@ -164,7 +165,7 @@ def space_file(algo: str) -> Path:
     return path
 
 
-def read_sections(path: Path) -> dict[str, dict[str, Any]]:
+def read_sections(path: Path) -> dict[str, Plain]:
     """Read a search-space file.
 
     :raises ConfigError: if it cannot be read or is not sections of parameters
@@ -172,18 +173,18 @@ def read_sections(path: Path) -> dict[str, dict[str, Any]]:
     data = read_yaml(path)
     if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
         raise ConfigError(f"{path}: expected sections of parameters (default and one per task)")
-    sections: dict[str, dict[str, Any]] = coerce(data)
+    sections: dict[str, Plain] = coerce(data)
     return sections
 
 
-def load_space(algo: str, task: str, extra: Path | None = None) -> dict[str, dict[str, Any]]:
+def load_space(algo: str, task: str, extra: Path | None = None) -> dict[str, Plain]:
     """The declaration of a search: shipped default -> shipped task -> the user's default -> the user's task.
 
     :param extra: the user's file; a parameter set to ``null`` is not searched
     :return: parameter name -> its fields, plain data that a study can keep
     :raises ConfigError: for a mistake in a file
     """
-    merged: dict[str, Any] = {}
+    merged: Plain = {}
     for path in (space_file(algo), extra):
         sections = read_sections(path) if path is not None else {}
         for name in ("default", task):
@@ -202,7 +203,7 @@ def _over(old: Any, new: Any) -> Any:
     return {**{key: value for key, value in old.items() if key not in dropped}, **new}
 
 
-def build_space(declared: Mapping[str, Mapping[str, Any]]) -> Space:
+def build_space(declared: Mapping[str, PlainMapping]) -> Space:
     """Parameters from their declaration.
 
     :raises ConfigError: naming the parameter and what is wrong with it
@@ -262,8 +263,8 @@ def _check_keys(parameter: Parameter, value: Any, where: str) -> None:
 
 
 def restrict(
-    declared: Mapping[str, Mapping[str, Any]], run: RunConfig, patterns: Iterable[str], fixed: Mapping[str, Any]
-) -> dict[str, dict[str, Any]]:
+    declared: Mapping[str, PlainMapping], run: RunConfig, patterns: Iterable[str], fixed: PlainMapping
+) -> dict[str, Plain]:
     """Leave out what is not to be searched or can have no effect.
 
     :param declared: the whole space
@@ -278,7 +279,7 @@ def restrict(
             raise ConfigError(f"--search {pattern!r} matches no parameter; {nearest(pattern, declared)}")
     space = {p.name: p for p in build_space(declared)}
     idle = _idle_keys(run)
-    left: dict[str, dict[str, Any]] = {}
+    left: dict[str, Plain] = {}
     for name, parameter in space.items():
         keys = tuple(key for key in parameter.keys if not _is_set(fixed, key))
         without = (parameter.keys and not keys) or any(_is_set(fixed, k) for s in parameter.sets.values() for k in s)
@@ -305,7 +306,7 @@ def _idle_keys(run: RunConfig) -> tuple[str, ...]:
     return tuple(idle)
 
 
-def _is_set(settings: Mapping[str, Any], key: str) -> bool:
+def _is_set(settings: PlainMapping, key: str) -> bool:
     value: Any = settings
     for name in key.split("."):
         if not isinstance(value, Mapping) or name not in value:
@@ -344,7 +345,7 @@ def project(space: Space, run: RunConfig) -> Values:
     return values
 
 
-def apply(space: Space, values: Mapping[str, Any], run: RunConfig) -> RunConfig:
+def apply(space: Space, values: PlainMapping, run: RunConfig) -> RunConfig:
     """A configuration with a trial's values laid over it.
 
     :raises ConfigError: if a value is of the wrong kind

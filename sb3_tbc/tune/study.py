@@ -7,10 +7,10 @@ import datetime
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import optuna
@@ -21,6 +21,7 @@ from optuna.storages.journal._file import get_lock_file
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.files import explained, write_atomic
 from sb3_tbc.outside import HIDDEN, one_line, without_password
@@ -80,9 +81,9 @@ class StudySettings:
     env: str
     task: str
     env_id: str
-    base: dict[str, Any]
-    baselines: dict[str, dict[str, Any]]
-    space: dict[str, dict[str, Any]]
+    base: Plain
+    baselines: dict[str, Plain]
+    space: dict[str, Plain]
     n_seeds: int
     first_seed: int
     objective: str
@@ -91,7 +92,7 @@ class StudySettings:
     eval_freq: int
     n_eval_episodes: int
     n_final_episodes: int
-    asked: dict[str, Any]
+    asked: Plain
 
     @property
     def run(self) -> RunConfig:
@@ -296,7 +297,7 @@ def names(storage: BaseStorage) -> set[str]:
 
 
 def open_study(
-    storage: BaseStorage, name: str, where: str, wanted: StudySettings | None, asked: Mapping[str, Any]
+    storage: BaseStorage, name: str, where: str, wanted: StudySettings | None, asked: PlainMapping
 ) -> tuple[Study, StudySettings]:
     """Load the study of this name, or create it with its first trials queued.
 
@@ -341,7 +342,7 @@ def read_settings(study: Study) -> StudySettings:
         raise ConfigError(f"study {study.study_name!r} was not made by this command or version") from error
 
 
-def check_same(settings: StudySettings, name: str, asked: Mapping[str, Any]) -> None:
+def check_same(settings: StudySettings, name: str, asked: PlainMapping) -> None:
     """Refuse options that would make a study's trials incomparable.
 
     :raises ConfigError: naming the option and both values
@@ -397,7 +398,7 @@ def make_sampler(name: str, seed: int | None, stream: tuple[int, ...] = ()) -> o
     key = name.removesuffix("Sampler").lower()
     if key not in known or key.startswith("base"):
         raise ConfigError(f"unknown sampler {name!r}; {nearest(key, known)}")
-    options: dict[str, Any] = {}
+    options: Plain = {}
     if seed is not None:
         options["seed"] = int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0])
     if key == "tpe":

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise, product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from stable_baselines3.common.torch_layers import get_actor_critic_arch
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.tbc_hrl import TBCHRL
@@ -80,7 +81,7 @@ def _hidden(level: SACLevel) -> tuple[list[int], list[int]]:
     return list(pi), list(qf)
 
 
-def _net_arch(level: str, pi: Sequence[int], qf: Sequence[int]) -> dict[str, Any]:
+def _net_arch(level: str, pi: Sequence[int], qf: Sequence[int]) -> Plain:
     return {level: {"policy_kwargs": {"net_arch": {"pi": list(pi), "qf": list(qf)}}}}
 
 
@@ -89,7 +90,7 @@ def mlp_parameters(sizes: Sequence[int]) -> int:
     return sum((before + 1) * after for before, after in pairwise(sizes))
 
 
-def _fit_actor(level: SACLevel, missing: int, total: int) -> dict[str, Any]:
+def _fit_actor(level: SACLevel, missing: int, total: int) -> Plain:
     """Widths of the low level's MLP actor, as even as the count allows."""
     pi, qf = _hidden(level)
     inputs, outputs = level.observation_space.shape[0], 2 * level.action_space.shape[0]  # type: ignore[index]
@@ -104,7 +105,7 @@ def _fit_actor(level: SACLevel, missing: int, total: int) -> dict[str, Any]:
     return _net_arch("low", min(found)[-1], qf)
 
 
-def _widen_critics(model: TBCHRL, missing: int) -> dict[str, Any]:
+def _widen_critics(model: TBCHRL, missing: int) -> Plain:
     """Add to the last hidden layer of each level's critics."""
     (low_pi, low_qf), (high_pi, high_qf) = _hidden(model.low), _hidden(model.high)
     per_unit = [

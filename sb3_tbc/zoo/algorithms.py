@@ -10,6 +10,7 @@ from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.outside import one_line
 from sb3_tbc.tasks.foreign import ROBOTICS
@@ -56,7 +57,7 @@ def build_model(run: RunConfig, env: VecEnv, seed: int, **options: Any) -> Agent
         ) from error
 
 
-def read_zip(path: Path) -> dict[str, Any]:
+def read_zip(path: Path) -> Plain:
     """The plain data of an agent's ``.zip``, read without unpickling anything.
 
     :raises ConfigError: if the file is missing, truncated, or not an agent of SB3's format
@@ -76,7 +77,7 @@ def _inside(folder: Path) -> str:
     return f"did you mean {found[0]}?{more}"
 
 
-def environment_of(path: Path, data: dict[str, Any], trust: bool = False) -> tuple[str, dict[str, Any]]:
+def environment_of(path: Path, data: Plain, trust: bool = False) -> tuple[str, Plain]:
     """Id and arguments of the environment that an agent says it was trained on.
 
     :param path: of the agent, for messages
@@ -101,7 +102,7 @@ def environment_of(path: Path, data: dict[str, Any], trust: bool = False) -> tup
     return env_id, env_kwargs
 
 
-def algorithm_of(path: Path, data: dict[str, Any]) -> str:
+def algorithm_of(path: Path, data: Plain) -> str:
     """Which algorithm an agent's ``.zip`` belongs to.
 
     :raises ConfigError: if it is not one of ours
@@ -121,7 +122,7 @@ def algorithm_of(path: Path, data: dict[str, Any]) -> str:
     )
 
 
-def observation_size(data: dict[str, Any]) -> int | None:
+def observation_size(data: Plain) -> int | None:
     """Entries of ``observation`` that an agent acts on, from what its ``.zip`` says; None if it does not say."""
     space = data.get("observation_space")
     described = str(space.get("spaces")) if isinstance(space, dict) else ""

@@ -16,6 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import explained, replacing, save_atomic, write_atomic
 from sb3_tbc.outside import one_line
@@ -187,7 +188,7 @@ class OptionTraceCallback(BaseCallback):
     """Writes every option of training to a CSV: when, where, subgoal, time budget, duration, reason of its end.
 
     :param path: the CSV file; what it holds of the steps before training begins is kept, as a resumed run needs it
-    :param every: keep one option in so many, to bound the file's size
+    :param every: write every n-th option only, which bounds the size of the file
     """
 
     HEADER = ("timesteps", "env", "time_budget", "duration", "reached", "reason", "episode_over", "subgoal")
@@ -216,7 +217,7 @@ class OptionTraceCallback(BaseCallback):
                 self._write(index, option, index in self.locals.get("episodes", {}))
         return True
 
-    def _write(self, index: int, option: dict[str, Any], episode_over: bool) -> None:
+    def _write(self, index: int, option: Plain, episode_over: bool) -> None:
         if self._file is None:
             return
         subgoal = " ".join(f"{x:.4g}" for x in option["subgoal"])

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from importlib import resources
-from typing import Any
 
 import yaml
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.zoo.algorithms import ALGORITHMS
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.environments import task_names
@@ -23,7 +23,7 @@ MEASURED = "measured.yml"
 """Beside this module: minutes of finished runs, which ``python -m sb3_tbc.report --measured`` writes."""
 
 
-def measured() -> dict[str, dict[str, Any]]:
+def measured() -> dict[str, Plain]:
     """Task -> ``steps``, ``minutes``, ``seeds`` of the committed runs with the shipped settings of ``tbc-hrl``."""
     text = resources.files("sb3_tbc.zoo").joinpath(MEASURED).read_text(encoding="utf-8")
     return dict(yaml.safe_load(text)["tasks"])

@@ -12,8 +12,8 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import digest, explained, remove, sync, write_atomic
 
@@ -93,7 +93,7 @@ def _state(folder: Path, timesteps: int, wall_time: float) -> str:
     return json.dumps({**state, "state_sha256": _sum_of(state)}, indent=2) + "\n"
 
 
-def _sum_of(state: dict[str, Any]) -> str:
+def _sum_of(state: Plain) -> str:
     return hashlib.sha256(json.dumps(state, sort_keys=True).encode()).hexdigest()
 
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import MAX_DEPTH, parse_yaml, read_yaml
@@ -16,7 +16,7 @@ from sb3_tbc.zoo.schema import RUN, coerce, validate
 CONFIGS = ("paper", "tuned")
 OTHER = "other"
 """Section of configuration files for environments that have none of their own."""
-ABLATIONS: dict[str, dict[str, Any]] = {
+ABLATIONS: dict[str, Plain] = {
     "no-ts": {"duration": "fixed", "remaining_time": False, "target": "decision", "duration_loss_coef": 0.0},
     "no-ndbc": {"low": {"policy_kwargs": {"ndbc": None}}, "sequence_length": 1},
 }
@@ -46,15 +46,15 @@ class RunConfig:
     config: str
     n_timesteps: int
     n_envs: int = 1
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
-    model: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: Plain = field(default_factory=dict)
+    model: Plain = field(default_factory=dict)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """As plain data for ``config.yml``."""
         return asdict(self)
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
+    def from_dict(cls, data: PlainMapping) -> RunConfig:
         """Back from ``config.yml``.
 
         :raises ConfigError: if keys are missing or unknown
@@ -65,7 +65,7 @@ class RunConfig:
             raise ConfigError(f"not a run's config.yml: {error}") from error
 
 
-def merge(base: Mapping[str, Any], change: Mapping[str, Any]) -> dict[str, Any]:
+def merge(base: PlainMapping, change: PlainMapping) -> Plain:
     """``base`` with ``change`` laid over it, section by section; a ``None`` replaces a whole section."""
     result = dict(base)
     for key, value in change.items():
@@ -88,7 +88,7 @@ def config_file(algo: str) -> Path:
     return path
 
 
-def read_file(path: Path, algo: str | None = None) -> dict[str, dict[str, Any]]:
+def read_file(path: Path, algo: str | None = None) -> dict[str, Plain]:
     """Read a configuration file and check all its sections.
 
     :param algo: algorithm whose settings they are; None allows those of any
@@ -100,7 +100,7 @@ def read_file(path: Path, algo: str | None = None) -> dict[str, dict[str, Any]]:
     return {name: _checked(coerce(section), algo, f"{path.name}, section {name}") for name, section in data.items()}
 
 
-def _checked(section: dict[str, Any], algo: str | None, where: str) -> dict[str, Any]:
+def _checked(section: Plain, algo: str | None, where: str) -> Plain:
     """A section and the ``tuned`` one inside of it."""
     plain = {key: value for key, value in section.items() if key != "tuned"}
     tuned = section.get("tuned")
@@ -108,14 +108,14 @@ def _checked(section: dict[str, Any], algo: str | None, where: str) -> dict[str,
     return checked if tuned is None else {**checked, "tuned": validate(tuned, algo, f"{where}, tuned")}
 
 
-def parse_overrides(items: Sequence[str]) -> dict[str, Any]:
+def parse_overrides(items: Sequence[str]) -> Plain:
     """Command-line settings: ``["low.learning_rate:1e-3"]`` gives ``{"low": {"learning_rate": 0.001}}``.
 
     Whether the algorithm has such a setting is checked by :func:`load_config`, which knows the algorithm.
 
     :raises ConfigError: for a malformed item, an unknown key or a value of the wrong kind
     """
-    result: dict[str, Any] = {}
+    result: Plain = {}
     for item in items:
         name, separator, text = item.partition(":")
         if not separator or not name:
@@ -135,7 +135,7 @@ def load_config(
     algo: str,
     task: str,
     config: str | None = None,
-    overrides: Mapping[str, Any] | None = None,
+    overrides: PlainMapping | None = None,
     ablation: str | None = None,
     path: Path | None = None,
 ) -> RunConfig:

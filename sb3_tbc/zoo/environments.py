@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly
@@ -93,7 +94,7 @@ def _known(name: str, tasks: Mapping[str, str]) -> list[str]:
     return [*tasks, *gym.registry] if "-v" in name or "/" in name else list(tasks)
 
 
-def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: Mapping[str, Any] | None = None) -> VecEnv:
+def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: PlainMapping | None = None) -> VecEnv:
     """A vector of monitored goal environments in this process.
 
     :param env_id: as registered
@@ -129,7 +130,7 @@ def _cause(error: Exception) -> str:
     return f"{type(error).__name__} in {Path(place.filename).name}, line {place.lineno}: {message}"
 
 
-def make_env(env_id: str, subgoals: Mapping[str, Any] | None = None, **env_kwargs: Any) -> gym.Env[Any, Any]:
+def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: Any) -> Env:
     """Make one environment, able to draw itself where it can; a foreign goal environment gets a derived subgoal space.
 
     Everything that needs an environment for an id makes it here: training, evaluation, films, the check of exports.
@@ -142,7 +143,7 @@ def make_env(env_id: str, subgoals: Mapping[str, Any] | None = None, **env_kwarg
     module = env_id.rpartition(":")[0]
     if module:
         _import(module, env_id)
-    env: gym.Env[Any, Any]
+    env: Env
     try:
         env = gym.make(env_id, **{"render_mode": "rgb_array", **env_kwargs})
     except TypeError:

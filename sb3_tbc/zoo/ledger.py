@@ -6,7 +6,7 @@ import json
 import math
 import platform
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -15,8 +15,9 @@ from typing import Any, Protocol
 import numpy as np
 import torch as th
 import yaml
-from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import remove, remove_temporary, write_atomic
 from sb3_tbc.outside import flat_name, folder_name
@@ -52,23 +53,23 @@ class Episodes(Protocol):
     """Per-episode arrays of an evaluation, each ``(n_episodes,)``; lengths and windows in environment steps."""
 
     @property
-    def successes(self) -> NDArray[Any]:
+    def successes(self) -> AnyArray:
         """Whether the episode succeeded."""
 
     @property
-    def lengths(self) -> NDArray[Any]:
+    def lengths(self) -> AnyArray:
         """Steps."""
 
     @property
-    def subgoal_success(self) -> NDArray[Any]:
+    def subgoal_success(self) -> AnyArray:
         """Share of the episode's windows that reached their subgoal."""
 
     @property
-    def mean_window(self) -> NDArray[Any]:
+    def mean_window(self) -> AnyArray:
         """Mean executed window of the episode."""
 
 
-def summarise(result: Episodes) -> dict[str, Any]:
+def summarise(result: Episodes) -> Plain:
     """What ``evaluate --json`` and ``final.json`` say of an evaluation; undefined means are ``None``, never NaN.
 
     ``outcomes`` has one digit per episode, in order, 1 for a success: the report pairs the episodes of two methods.
@@ -92,12 +93,12 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def to_json(data: Mapping[str, Any]) -> str:
+def to_json(data: PlainMapping) -> str:
     """JSON with a final newline; refuses NaN, which other readers do not understand."""
     return json.dumps(data, indent=2, allow_nan=False) + "\n"
 
 
-def versions() -> dict[str, Any]:
+def versions() -> Plain:
     """Packages, commit, Python and processor that a result depends on."""
     packages = {}
     for name in PACKAGES:
@@ -190,7 +191,7 @@ class RunFolder:
         """Whether there is an unfinished run that ``--resume`` goes on with."""
         return self.exists and not self.finished and (has_checkpoint(self.path) or self.model.is_file())
 
-    def start(self, config: Mapping[str, Any], command: str) -> None:
+    def start(self, config: PlainMapping, command: str) -> None:
         """Write what is known before training: versions, command, and the configuration, which makes it a run."""
         write_atomic(self.path / VERSIONS, to_json(versions()))
         write_atomic(self.path / COMMAND, command + "\n")
@@ -214,14 +215,14 @@ class RunFolder:
         remove_unfinished(self.path)
         remove_temporary(self.path)
 
-    def read_config(self) -> dict[str, Any]:
+    def read_config(self) -> Plain:
         """The configuration the run was started with.
 
         :raises ConfigError: if there is none or it cannot be read
         """
         return _read(self.path / CONFIG, read_yaml)
 
-    def read_final(self) -> dict[str, Any]:
+    def read_final(self) -> Plain:
         """The result.
 
         :raises ConfigError: if there is none or it cannot be read
@@ -261,7 +262,7 @@ class RunFolder:
         if any(row.timesteps > timesteps for row in rows):
             write_evaluations(self.evaluations, [row for row in rows if row.timesteps <= timesteps])
 
-    def finish(self, result: Mapping[str, Any]) -> None:
+    def finish(self, result: PlainMapping) -> None:
         """Write the result, which marks the run as done."""
         write_atomic(self.path / FINAL, to_json(result))
 
@@ -283,7 +284,7 @@ class RunFolder:
             write_atomic(target.path / name, (self.path / name).read_text(encoding="utf-8"))
 
 
-def _read(path: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
+def _read(path: Path, read: Callable[[Path], Any]) -> Plain:
     if not path.is_file():
         raise ConfigError(f"{path.parent} holds no run: {path.name} is missing")
     data = read(path)
@@ -292,7 +293,7 @@ def _read(path: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
     return data
 
 
-def curve_summary(rows: list[EvaluationRow]) -> dict[str, Any]:
+def curve_summary(rows: list[EvaluationRow]) -> Plain:
     """Best evaluation and stability of a curve: share at 0.9 or more from the first such one on, and the worst."""
     if not rows:
         return {"best_success_rate": None, "stable_share": None, "worst_after_first_90": None}

@@ -6,12 +6,12 @@ import shlex
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import (
     ConfigError,
     DivergedError,
@@ -68,7 +68,7 @@ class RunSpec:
     n_eval_episodes: int = 20
     n_final_episodes: int = 100
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> Plain:
         """As plain data for ``config.yml``; the run's own keys come first."""
         watching = {k: v for k, v in asdict(self).items() if k != "run"}
         run = self.run.to_dict()
@@ -76,7 +76,7 @@ class RunSpec:
         return {**run, **watching, "model": model}
 
     @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> RunSpec:
+    def from_dict(cls, data: Plain) -> RunSpec:
         """Back from ``config.yml``.
 
         :raises ConfigError: if keys are missing or unknown
@@ -89,7 +89,7 @@ class RunSpec:
             raise ConfigError(f"not a run's config.yml: {error}") from error
 
     @property
-    def identity(self) -> dict[str, Any]:
+    def identity(self) -> Plain:
         """What names a result in ``final.json`` and inside the agent's ``.zip``."""
         run = self.run
         return {
@@ -131,7 +131,7 @@ class RunOptions:
     stop: StopRequest = field(default_factory=StopRequest)
 
 
-def evaluation_envs(env_id: str, n_episodes: int, seed: int, env_kwargs: dict[str, Any]) -> VecEnv:
+def evaluation_envs(env_id: str, n_episodes: int, seed: int, env_kwargs: Plain) -> VecEnv:
     """Environments for evaluations: up to ten side by side, because acting costs the same for ten as for one."""
     return make_envs(env_id, min(10, n_episodes), seed, env_kwargs)
 
@@ -151,7 +151,7 @@ def start_run(
     options: RunOptions,
     overwrite: bool = False,
     after_eval: BaseCallback | None = None,
-) -> dict[str, Any]:
+) -> Plain:
     """Train from the beginning and return the content of ``final.json``.
 
     :param after_eval: called after each evaluation, e.g. by a search that may give the run up
@@ -182,7 +182,7 @@ def _check_new(folder: RunFolder, overwrite: bool) -> None:
         raise ConfigError(f"{folder.path} holds {state}; nothing was changed. Use {cure}")
 
 
-def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None = None) -> dict[str, Any]:
+def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None = None) -> Plain:
     """Go on from the last whole checkpoint of a run, or evaluate it where only that was left to do.
 
     A finished run has nothing left to do: its result is returned, so that a script may resume until all is done.
@@ -217,7 +217,7 @@ def _trained(folder: RunFolder) -> int:
     return steps if isinstance(steps, int) else 0
 
 
-def _only_evaluate(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dict[str, Any]:
+def _only_evaluate(spec: RunSpec, folder: RunFolder, options: RunOptions) -> Plain:
     """Finish a run that ended between training and its result."""
     env = make_envs(spec.env_id, spec.run.n_envs, spec.seed, spec.run.env_kwargs)
     try:
@@ -228,7 +228,7 @@ def _only_evaluate(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dic
     return finish(model, spec, folder, options, rows[-1].wall_time if rows else 0.0)
 
 
-def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> dict[str, Any]:
+def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> Plain:
     checkpoint = find_checkpoint(folder.path)
     if checkpoint is None:
         again = "start with --keep-checkpoint to go on after the end"
@@ -278,7 +278,7 @@ class Training:
         self.trace = OptionTraceCallback(folder.path / "options.csv") if options.trace else None
         self.consistent = ConsistentState()
 
-    def run(self) -> dict[str, Any]:
+    def run(self) -> Plain:
         """Train, evaluate, write the result, and return it.
 
         :raises Interrupted: when stopped
@@ -384,7 +384,7 @@ NOT_A_DISTRIBUTION = "to satisfy the constraint"
 """How torch says that an actor's mean is NaN."""
 
 
-def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, trained: float) -> dict[str, Any]:
+def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, trained: float) -> Plain:
     """Evaluate the trained agent, write the result, and only then remove what a resumed run would have needed.
 
     :param trained: seconds that training took
@@ -396,7 +396,7 @@ def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, 
     return result
 
 
-def _final(model: Agent, spec: RunSpec, folder: RunFolder, trained: float) -> dict[str, Any]:
+def _final(model: Agent, spec: RunSpec, folder: RunFolder, trained: float) -> Plain:
     """Evaluate the trained agent as ``python -m sb3_tbc.evaluate`` does, on ``eval_seed``."""
     seed = final_seed(spec.seed)
     env = evaluation_envs(spec.env_id, spec.n_final_episodes, seed, spec.run.env_kwargs)

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 
+from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import Arrays
 from sb3_tbc.errors import DivergedError
 from sb3_tbc.tbc_hrl import TBCHRL
 
@@ -32,7 +32,7 @@ class LossWatch(KVWriter):
         self.limit = limit
         self.reason = ""
 
-    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
+    def write(self, key_values: Plain, key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
         """Look at the critics' losses of one dump."""
         for key, value in key_values.items():
             if key.endswith("critic_loss") and not self.reason and not abs(float(value)) < self.limit:
@@ -88,9 +88,9 @@ class ConsistentState(BaseCallback):
 
     def __init__(self) -> None:
         super().__init__()
-        self._attributes: dict[str, Any] = {}
+        self._attributes: Plain = {}
         self._stored: tuple[int, ...] = ()
-        self._arrays: dict[str, NDArray[Any]] = {}
+        self._arrays: Arrays = {}
 
     def _on_step(self) -> bool:
         return True

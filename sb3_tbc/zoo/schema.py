@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.settings import NotEmpty, Range, Settings, hints, read_partial
 from sb3_tbc.tbc_hrl.config import FlatConfig, HACConfig, HiTSConfig, TBCConfig
@@ -48,7 +49,7 @@ class RunKeys(Settings):
     """Environment steps of training."""
     n_envs: Annotated[int, Range(1, 4096)] = 1
     """Parallel environments."""
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    env_kwargs: Plain = field(default_factory=dict)
     """Arguments of ``gymnasium.make``."""
     policy: Literal["MultiInputPolicy"] = "MultiInputPolicy"
     """Policy class; there is this one."""
@@ -60,7 +61,7 @@ RUN = ("n_timesteps", "n_envs", "env_kwargs")
 """Keys of a section that become fields of :class:`~sb3_tbc.zoo.config.RunConfig`."""
 
 
-def kinds_of(algo: str | None) -> dict[str, Any]:
+def kinds_of(algo: str | None) -> Plain:
     """Every key that a section of an algorithm's configuration may have, and its type.
 
     :param algo: name of the algorithm; None, or a name that is not known, allows the settings of any
@@ -83,7 +84,7 @@ def coerce(value: Any) -> Any:
     return value
 
 
-def validate(section: Any, algo: str | None, where: str) -> dict[str, Any]:
+def validate(section: Any, algo: str | None, where: str) -> Plain:
     """Check every key and value of a section and return it with whole floats as integers where those are asked for.
 
     :param section: what was read, numbers already coerced

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Env
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.tasks.probe import said_success
@@ -25,7 +25,7 @@ OUTCOME_SECONDS = 1.5
 """How long the last picture of an episode stays, so that its outcome can be read."""
 
 
-def film(model: Agent, env: gym.Env[Any, Any], seed: int | None = None) -> Iterator[Frame]:
+def film(model: Agent, env: Env, seed: int | None = None) -> Iterator[Frame]:
     """The frames of :func:`episode_frames`, the last one held for :data:`OUTCOME_SECONDS`."""
     frame = None
     for frame in episode_frames(model, env, seed):
@@ -35,12 +35,12 @@ def film(model: Agent, env: gym.Env[Any, Any], seed: int | None = None) -> Itera
             yield frame
 
 
-def frames_per_second(env: gym.Env[Any, Any]) -> float:
+def frames_per_second(env: Env) -> float:
     """How many steps of a task take a second."""
     return float(env.metadata.get("render_fps", 30))
 
 
-def episode_frames(model: Agent, env: gym.Env[Any, Any], seed: int | None = None) -> Iterator[Frame]:
+def episode_frames(model: Agent, env: Env, seed: int | None = None) -> Iterator[Frame]:
     """Frames of one deterministic episode, one per step and one at the end, each ``(height, width, 3)``.
 
     The episode ends as in an evaluation: success, time limit, or the high level's action budget used up. Our own tasks
@@ -77,7 +77,7 @@ def _pursuit(model: TBCHRL, live: TwoLevelState) -> Overlay:
     return Overlay(live.subgoal[0], float(model.rules.remaining(left)[0]), text, max(math.ceil(left[0]), 0))
 
 
-def _frame(env: gym.Env[Any, Any], shown: Overlay, observation: Any) -> Frame:
+def _frame(env: Env, shown: Overlay, observation: Any) -> Frame:
     draws_itself = hasattr(env.unwrapped, "set_overlay")
     if draws_itself:
         env.unwrapped.set_overlay(*shown)  # type: ignore[attr-defined]
@@ -95,7 +95,7 @@ def _frame(env: gym.Env[Any, Any], shown: Overlay, observation: Any) -> Frame:
     return frame
 
 
-def record_video(model: Agent, env: gym.Env[Any, Any], path: Path, n_episodes: int = 3, seed: int = 0) -> None:
+def record_video(model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: int = 0) -> None:
     """Record deterministic episodes to an mp4 file, which appears only when it is complete.
 
     :param model: a trained agent
