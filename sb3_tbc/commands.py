@@ -102,10 +102,11 @@ def stop_like_ctrl_c() -> None:
 
 
 def add_trust(parser: argparse.ArgumentParser) -> None:
-    """The option that lets a saved agent run code that it brings along."""
+    """Add the option that allows a saved agent's file to run code."""
     parser.add_argument(
-        "--trust", action="store_true", help="let the agent's file run code that it brings along: needed for agents of "
-        "version 0.1, for classes of your own, and to import the module of its environment",
+        "--trust", action="store_true", help="load the agent even if its file can run code on this machine; use it "
+        "only for files whose origin you know. Needed for agents of version 0.1, for policy classes of your own, and "
+        "for agents whose environment is in a module of its own",
     )  # fmt: skip
 
 

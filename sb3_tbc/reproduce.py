@@ -43,7 +43,11 @@ def build_parser() -> Parser:
     add("--algos", nargs="+", default=sorted(ALGORITHMS), help="by default all of them: hac, hits, sac, tbc-hrl")
     add("--seeds", type=positive_int, default=10, help="seeds of each task and method; the paper has 10")
     add("--first-seed", type=int, default=0, help="the seeds are this one and the next ones")
-    add("--config", choices=CONFIGS, help="values of the settings; by default tuned where there are such")
+    add(
+        "--config",
+        choices=CONFIGS,
+        help="which values to use; by default tuned, for tasks that have them",
+    )
     add("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
     add("--variant", help="name of the runs' folder; by default from --config and --ablation")
     add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as train takes them")
@@ -57,7 +61,7 @@ def build_parser() -> Parser:
         "slurm, ray: a cluster whose machines all see the folders below (extra cluster)")  # fmt: skip
     add("--slurm", nargs="+", default=[], metavar="NAME:VALUE", help="settings of the Slurm jobs, as submitit names "
         "them, e.g. slurm_partition:short timeout_min:600")  # fmt: skip
-    add("--address", help="of the Ray cluster; by default that of RAY_ADDRESS, or a new one on this machine")
+    add("--address", help="address of the Ray cluster; by default RAY_ADDRESS, or a new cluster on this machine")
     add("--dry-run", action="store_true", help="print what would be run and how long it takes, and stop")
     add("--log-folder", type=Path, default=Path("runs"), help="folder of the runs")
     add("--ledger", type=Path, default=Path("results"), help="folder that the small result files are copied to")

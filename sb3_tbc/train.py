@@ -47,10 +47,10 @@ def build_parser() -> Parser:
     what.add_argument("--n-timesteps", type=positive_int, help="environment steps; by default the task's, see --list")
     what.add_argument("--n-envs", type=positive_int, help="environments side by side; by default the configuration's")
     what.add_argument("--config", metavar="{paper,tuned,FILE.yml}", help="paper: the values of the paper's tables; "
-                      "tuned: those that measurements improved, the default where there are any; or a file with "
-                      "sections like those of zoo_configs")  # fmt: skip
-    what.add_argument("--config-file", type=Path, metavar="FILE.yml", help="a file of your own, of which --config "
-                      "paper or tuned picks the values; --config FILE.yml alone is shorter")  # fmt: skip
+                      "tuned: values that did better in measurements, the default for tasks that have them; or a file "
+                      "with sections like those of zoo_configs")  # fmt: skip
+    what.add_argument("--config-file", type=Path, metavar="FILE.yml", help="a configuration file of your own; --config "
+                      "says which of its values to use, paper or tuned")  # fmt: skip
     what.add_argument("--ablation", help="leave a part out: no-ts (timed subgoals) or no-ndbc (the circuit)")
     what.add_argument("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, which win "
                       "over the configuration; dots lead into a level, e.g. low.learning_rate:1e-3")  # fmt: skip

@@ -221,7 +221,7 @@ def test_ctrl_c_saves_and_resume_finishes(
         (["--env", "Pendulm"], "unknown environment 'Pendulm'; did you mean 'Pendulum'?"),
         (["--env", "sb3_tbc/UR5reach-v0"], "did you mean 'sb3_tbc/UR5Reacher-v0'?"),
         (["--env", "no_such_module:Env-v0"], "cannot import module 'no_such_module'"),
-        (["--env", "Pendulum-v1"], "is not a goal environment: its observation has no observation"),
+        (["--env", "Pendulum-v1"], "its observation must be a Dict with the keys"),
         (["--algo", "hit"], "unknown algorithm 'hit'; did you mean 'hits'?"),
         (["--hyperparams", "low.learningrate:1"], "did you mean 'learning_rate'?"),
         (["--hyperparams", "env_kwargs:{observation: compct}"], "observation must be one of"),
@@ -259,7 +259,7 @@ def test_an_action_space_that_is_no_box(tmp_path: Path, capsys: pytest.CaptureFi
     if "SwitchGoal-v0" not in gym.registry:
         gym.register("SwitchGoal-v0", Switch, disable_env_checker=True)
     assert train.main(["--env", "SwitchGoal-v0", "--log-folder", str(tmp_path)]) == 2
-    assert "only a Box (continuous actions) is supported" in said(capsys)
+    assert "its actions must be a Box action space" in said(capsys)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -18,7 +18,15 @@ from sb3_tbc.extras import MissingExtraError, require
 from sb3_tbc.ndbc.wiring import NDBCWiring
 from sb3_tbc.tune import command as tune
 
-RIDDLES = ("in so many", "is said too", "silent for so long", "goes on where")
+RIDDLES = (
+    "in so many",
+    "is said too",
+    "silent for so long",
+    "goes on where",
+    "brings along",
+    "where there are such",
+    "of which --config",
+)
 
 
 def parsers() -> dict[str, argparse.ArgumentParser]:

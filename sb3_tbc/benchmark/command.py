@@ -75,8 +75,8 @@ def _add_train(commands: Any) -> None:
     train.add_argument("--what", nargs="+", default=["speed", "split", "update"], metavar="WHAT",
                        help="any of speed, split, floor, update, growth, n-envs, memory, budget; by default speed, "
                        "split and update")  # fmt: skip
-    train.add_argument("--config", choices=CONFIGS, help="values of the task's settings; by default tuned where there "
-                       "are such")  # fmt: skip
+    train.add_argument("--config", choices=CONFIGS, help="values of the task's settings; by default tuned, for tasks "
+                       "that have them")  # fmt: skip
     train.add_argument("--n-envs", type=positive_int, help="environments side by side in split; by default the "
                        "configuration's")  # fmt: skip
     train.add_argument("--steps", type=positive_int, default=2000, help="environment steps of a stretch of learning")

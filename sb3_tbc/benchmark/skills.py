@@ -129,7 +129,7 @@ def record_file(path: Path, out: Path | None, every: int, trust: bool = False) -
     :param path: the agent
     :param out: where to write; by default where the skills of this package lie, under the task's name
     :param every: see :func:`record`
-    :param trust: whether the file may run code that it brings along
+    :param trust: whether the file may run code
     :return: the file written
     :raises ConfigError: if the agent does not say what it was trained on
     """

@@ -9,7 +9,8 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy, FloatArray
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy
 
 
 def to_c(policy: ExportedPolicy) -> str:

@@ -20,6 +20,7 @@ from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import Circuit, ExportedPolicy
 from sb3_tbc.extras import require
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.environments import make_env
 
@@ -27,7 +28,6 @@ STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
 CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=c99")
 CLOSED_FORM_TOLERANCE = 0.05
 """Larger differences of actions, as a share of half their range, draw a warning."""
-GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 Observation = Mapping[str, AnyArray]
 

@@ -18,7 +18,7 @@ SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
 EXAMPLES = {
     "sb3_tbc.export model.zip --format c": "model.c: one file of C99 for a microcontroller",
     "sb3_tbc.export model.zip --format onnx --check 1000": "ONNX, compared with the agent over 1000 steps",
-    "sb3_tbc.export model.zip --format numpy --output policy.py": "a Python module that needs NumPy alone",
+    "sb3_tbc.export model.zip --format numpy --output policy.py": "a Python module that needs only NumPy",
 }
 
 
@@ -58,7 +58,7 @@ def write_c(policy: ExportedPolicy, path: Path) -> None:
 
 
 def write_numpy(policy: ExportedPolicy, path: Path) -> None:
-    """Write the policy as a Python module that needs NumPy alone."""
+    """Write the policy as a Python module that needs only NumPy."""
     from sb3_tbc.export.numpy_module import to_numpy_module
 
     write_atomic(path, to_numpy_module(policy))

@@ -9,7 +9,8 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy, FloatArray
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy
 from sb3_tbc.outside import one_line
 
 OPSET = 17

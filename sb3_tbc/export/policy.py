@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.level.policies import MLPActor, NDBCActor
 from sb3_tbc.ndbc.dissipative import DissipativeCell
@@ -19,7 +20,6 @@ from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.scheduling import ReachRule
 
-FloatArray = NDArray[np.floating[Any]]
 ACTIVATIONS = {nn.ReLU: "relu", nn.Tanh: "tanh"}
 
 

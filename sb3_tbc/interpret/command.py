@@ -54,7 +54,7 @@ def build_parser() -> Parser:
     parser.add_argument("--n-random", type=positive_int, default=5, help="random lesions of each size")
     parser.add_argument("--max-alone", type=positive_int, default=24, help="units lesioned one by one, the most "
                         "active ones first")  # fmt: skip
-    parser.add_argument("--synapses", action="store_true", help="cut every synapse, too, one at a time: slow")
+    parser.add_argument("--synapses", action="store_true", help="also remove each synapse, one at a time (slow)")
     parser.add_argument("--device", default="cpu", help="torch device")
     parser.add_argument("--num-threads", type=positive_int, default=1, help="torch threads")
     add_trust(parser)

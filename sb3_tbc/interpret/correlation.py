@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.interpret.units import FloatArray
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.stats import holm
 
 N_SHIFTS, N_RESAMPLES = 5000, 1000

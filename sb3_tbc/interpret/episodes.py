@@ -10,7 +10,8 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.interpret.units import FloatArray, Lesion, Units, stack
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.interpret.units import Lesion, Units, stack
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.smdp.spaces import GoalObservation

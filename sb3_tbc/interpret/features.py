@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.interpret.episodes import Trace
-from sb3_tbc.interpret.units import FloatArray
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.interpret.units import FloatArray
+from sb3_tbc.arrays import FloatArray
 
 ACTIVATION_BINS, PHASE_BINS, N_SHUFFLES = 8, 4, 50
 SHORTEST_WINDOW = PHASE_BINS

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.interpret.episodes import HeldOutEpisodes, Outcome, Trace
-from sb3_tbc.interpret.units import CircuitUnits, FloatArray, Lesion, Units, clamp, no_lesion
+from sb3_tbc.interpret.units import CircuitUnits, Lesion, Units, clamp, no_lesion
 
 N_RESAMPLES = 2000
 MAX_STEPS = 3000

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.extras import require
 from sb3_tbc.interpret.episodes import Trace
 from sb3_tbc.interpret.features import TaskSpace, places_of
-from sb3_tbc.interpret.units import FloatArray, Units
+from sb3_tbc.interpret.units import Units
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
 COLUMNS, MOST_PANELS = 4, 12

@@ -11,10 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_tbc.aliases import Env, Plain
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.extras import require
 from sb3_tbc.interpret.episodes import HeldOutEpisodes, Trace
 from sb3_tbc.interpret.features import TaskSpace, places_of
-from sb3_tbc.interpret.units import FloatArray, Units, clamp
+from sb3_tbc.interpret.units import Units, clamp
 from sb3_tbc.tbc_hrl import TBCHRL
 
 

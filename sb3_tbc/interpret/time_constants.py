@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.interpret.episodes import Trace
-from sb3_tbc.interpret.units import CircuitUnits, FloatArray, Units, no_lesion
+from sb3_tbc.interpret.units import CircuitUnits, Units, no_lesion
 
 
 class TimeConstants(NamedTuple):

@@ -11,13 +11,13 @@ import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.level.policies import GaussianHead, MLPActor, NDBCActor
 from sb3_tbc.ndbc.dissipative import DissipativeCell
 from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.ndbc.wiring import LAYERS
 from sb3_tbc.tbc_hrl import TBCHRL
 
-FloatArray = NDArray[np.floating[Any]]
 Mask = NDArray[np.bool_]
 
 

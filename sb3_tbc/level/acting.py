@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.level.policies import GaussianHead, LevelPolicy, MLPActor, NDBCActor
 from sb3_tbc.level.storage import Block
-
-FloatArray = NDArray[np.floating[Any]]
-"""float32 in all that is given and returned here."""
 
 
 def _relu(x: FloatArray) -> FloatArray:

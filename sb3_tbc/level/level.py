@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any, Protocol, cast
+from typing import Protocol, cast
 
 import numpy as np
 import torch as th
@@ -16,6 +16,7 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import HierarchyError, NonFiniteError
 from sb3_tbc.level.acting import FrozenActor
 from sb3_tbc.level.policies import LevelPolicy
@@ -24,10 +25,8 @@ from sb3_tbc.level.update import AVERAGE_DECAY, EXTREMES, SACUpdate
 from sb3_tbc.replay.batch import LevelBatch
 from sb3_tbc.smdp.bounds import ValueBounds
 
-FloatArray = NDArray[np.floating[Any]]
-
 BURST_ROWS = 32_768
-"""Transitions that are gathered at once, for several updates; many more no longer fit the caches."""
+"""Transitions drawn in one go, for several updates. Many more would not fit into the processor's caches."""
 
 
 class BurstBuffer(Protocol):
@@ -54,14 +53,16 @@ def add_figures(total: dict[str, float], part: dict[str, float], share: float) -
 
 
 class SACLevel(SAC):
-    """SAC for one level. It neither collects nor stores: ``replay_buffer`` is filled by whoever owns the level.
+    """SAC for one level. It does not collect or store transitions: the agent that owns the level fills
+    its ``replay_buffer``.
 
     :param policy: policy class, by default :class:`LevelPolicy`
     :param observation_space: flat observations of the level
     :param action_space: the level's actions, unit coordinates
     :param replay_buffer: gives :class:`LevelBatch` bursts; may be set later
-    :param ent_coef_learning_rate: of the automatic temperature, by default the schedule ``learning_rate``
-    :param actor_learning_rate: of the actor, by default ``learning_rate``; circuits take larger steps than critics
+    :param ent_coef_learning_rate: learning rate of the automatic temperature, by default ``learning_rate``
+    :param actor_learning_rate: learning rate of the actor, by default ``learning_rate``; circuits need larger steps
+        than critics
     :param compile: "auto" (compiled if there is a C++ compiler), True or False (eager)
     :param name: names the level in messages and logs (``low/critic_loss``)
     :param label_coef: weight of a regression of the last action coordinate toward labels of the replay buffer in the

@@ -6,14 +6,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.ndbc.cell import ConductanceCell
 
 if TYPE_CHECKING:
     from sb3_tbc.ndbc.network import NDBCNet
-
-FloatArray = NDArray[np.floating[Any]]
 
 
 class ClosedFormError(NamedTuple):

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from torch.nn import functional
 
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.ndbc.cell import ConductanceCell
 from sb3_tbc.ndbc.dissipative import DissipativeCell
 
 if TYPE_CHECKING:
     from sb3_tbc.ndbc.network import NDBCNet
-
-FloatArray = NDArray[np.floating[Any]]
 
 
 class FrozenNDBC:

@@ -10,9 +10,10 @@ import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_tbc.arrays import Float32
 from sb3_tbc.errors import HierarchyError
 from sb3_tbc.replay.batch import LevelBatch
-from sb3_tbc.replay.ring import Float32, RingBuffer
+from sb3_tbc.replay.ring import RingBuffer
 from sb3_tbc.smdp.hindsight import HighLevelSteps, LowLevelSteps, ordered_pairs
 from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.smdp.rewards import LowLevelReward

@@ -13,10 +13,8 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tbc.aliases import Space
-from sb3_tbc.arrays import AnyArray, Arrays
+from sb3_tbc.arrays import AnyArray, Arrays, Float32
 from sb3_tbc.replay.batch import LevelBatch
-
-Float32 = NDArray[np.float32]
 
 
 class RingBuffer(BaseBuffer):

@@ -1,8 +1,8 @@
 """Ends an episode when the high level's decisions are used up, where every other end of an episode comes from.
 
-The agent alone knows when that is, but whoever watches episodes (``Monitor``, ``VecMonitor``, any wrapper) has to see
-it as an ordinary truncation. So the agent announces the last window of an episode when it begins, and the environment
-itself truncates the step that ends it.
+The agent alone knows when that is, but everything that watches episodes (``Monitor``, ``VecMonitor``, any wrapper)
+has to see it as an ordinary truncation. So the agent announces the last window of an episode when it begins, and the
+environment itself truncates the step that ends it.
 """
 
 from __future__ import annotations

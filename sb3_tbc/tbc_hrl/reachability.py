@@ -9,9 +9,8 @@ import torch as th
 from torch import nn
 from torch.nn import functional
 
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import Float32, FloatArray
 from sb3_tbc.replay.buffers import ReachPairs, SubgoalReplayBuffer
-from sb3_tbc.replay.ring import Float32
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
 UPDATE_EVERY = 4

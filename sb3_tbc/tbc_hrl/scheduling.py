@@ -6,9 +6,8 @@ import math
 
 import numpy as np
 
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import Float32, FloatArray
 from sb3_tbc.level.level import SACLevel
-from sb3_tbc.replay.ring import Float32
 from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.smdp.views import LevelViews

@@ -90,8 +90,8 @@ def build_parser() -> Parser:
     add("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a fortieth of a run")
     add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (default: 20)")
     add("--n-final-episodes", type=positive_int, help="episodes of the evaluation after training (default: 20)")
-    add("--config", choices=CONFIGS, help="values of all settings that are not searched; by default tuned where there "
-        "are such")  # fmt: skip
+    add("--config", choices=CONFIGS, help="values of all settings that are not searched; by default tuned, for tasks "
+                       "that have them")  # fmt: skip
     add("--config-file", type=Path, help="take them from this file, with sections like those of zoo_configs")
     add("--hyperparams", nargs="+", metavar="NAME:VALUE", help="settings that keep this value in all trials")
     add("--search", nargs="+", metavar="NAME", help="search only these parameters; * and ? stand for other characters")

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.smdp.goal_spaces import goal_space_problems
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly
 from sb3_tbc.tasks.generic import DescribedGoalEnv, GoalEnvDescription
@@ -29,7 +29,6 @@ OTHER_PACKAGES = {  # how ids begin: module that registers them, name of its dis
 }
 _DESCRIPTIONS: dict[str, GoalEnvDescription] = {}
 """Descriptions by id and arguments: environments made alike need the random episodes only once."""
-GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 
 
 def task_names() -> dict[str, str]:
@@ -152,9 +151,7 @@ def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: An
         if subgoals:
             raise ConfigError(f"{env_id!r} brings its own subgoal space; leave out `subgoals`, got {dict(subgoals)}")
         return env
-    keys = env.observation_space.spaces if isinstance(env.observation_space, spaces.Dict) else {}
-    is_goal_env = all(key in keys for key in GOAL_KEYS) and isinstance(env.action_space, spaces.Box)
-    if not is_goal_env:
+    if goal_space_problems(env.observation_space, env.action_space):  # told by check_goal_env
         return env
     made_alike = repr((env.spec, sorted(env_kwargs.items()), sorted((subgoals or {}).items())))
     env = described = DescribedGoalEnv(env, description=_DESCRIPTIONS.get(made_alike), **(subgoals or {}))
@@ -167,14 +164,9 @@ def check_goal_env(env: VecEnv, env_id: str) -> None:
 
     :raises ConfigError: naming what is missing
     """
-    space = env.observation_space
-    missing = [k for k in GOAL_KEYS if not isinstance(space, spaces.Dict) or k not in space.spaces]
-    if missing:
+    problems = goal_space_problems(env.observation_space, env.action_space)
+    if problems:
         raise ConfigError(
-            f"{env_id!r} is not a goal environment: its observation has no {', '.join(missing)}; "
-            f"use one derived from gymnasium_robotics.core.GoalEnv, e.g. {', '.join(task_names())}"
-        )
-    if not isinstance(env.action_space, spaces.Box):
-        raise ConfigError(
-            f"{env_id!r} has actions {env.action_space}, but only a Box (continuous actions) is supported"
+            f"{env_id!r} cannot be used: {'; '.join(problems)}. Use a goal environment with continuous actions, "
+            f"derived from gymnasium_robotics.core.GoalEnv, e.g. {', '.join(task_names())}"
         )

@@ -115,7 +115,7 @@ class RunOptions:
     :param checkpoint_seconds: time between checkpoints; infinite for none, but for the one when stopped
     :param keep_checkpoint: keep the last checkpoint (with replay buffers) of a finished run
     :param save_at_end: save a checkpoint when training is stopped, or ended by a fault of an environment
-    :param trust: whether a checkpoint may run code that it brings along, see :func:`.load_model`
+    :param trust: whether a checkpoint may run code, see :func:`.load_model`
     :param stop: tells whether the user asked to stop; training stops at the next point to go on from
     """
 
