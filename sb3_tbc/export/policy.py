@@ -168,6 +168,11 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     layout, rules, subgoals = model.views, model.rules, model.views.subgoals
     if isinstance(model.schedule, ReachRule):
         raise ConfigError("an agent with duration='rule' cannot be exported: its windows come from another network")
+    if rules.may_be_reconsidered:
+        raise ConfigError(
+            "an agent with window_end='reconsider' cannot be exported: the high level's critic ends its windows, and "
+            "exports hold actors alone; load it with window_end='timed' to export it with windows that run to their end"
+        )
     unit_time = None if model.schedule is None else model.schedule.unit
     sizes = {f"n_{key}": _width(model, name) for key, name in GOAL_PARTS.items()}
     probe = _Probe(sizes["n_observation"], sizes["n_achieved"])

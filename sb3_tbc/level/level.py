@@ -266,6 +266,18 @@ class SACLevel(SAC):
         """
         return self._frozen[average].act(observations, states, deterministic, rng)
 
+    def values(self, observations: FloatArray, unit_actions: FloatArray) -> FloatArray:
+        """The lowest of the critics' values of actions, ``(n,)``.
+
+        :param observations: ``(n, observation_dim)``
+        :param unit_actions: ``(n, action_dim)`` in [-1, 1]
+        """
+        with th.no_grad():
+            seen, actions = (
+                th.as_tensor(x, dtype=th.float32, device=self.device) for x in (observations, unit_actions)
+            )
+            return np.asarray(th.cat(self.policy.critic(seen, actions), dim=1).min(dim=1).values.cpu().numpy())
+
     def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
         """Memory states ``(n, state_dim)`` after a step with these observations, from the current weights."""
         return self._frozen[False].advance(observations, states)

@@ -249,7 +249,7 @@ class SubgoalReplayBuffer(RingBuffer):
         self, here: Float32, achieved: Float32, subgoal: Float32, expired: NDArray[np.bool_]
     ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
         """Rewards and ends of relabelled steps."""
-        if self.reward.kind == "sparse" and self.rules.window_end == "timed":
+        if self.reward.kind == "sparse" and not self.rules.ends_when_reached:
             return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
         return self.reward.rewards_and_ends(here, achieved, subgoal, expired)
 

@@ -42,6 +42,9 @@ class Proposal(NamedTuple):
 HighLevel = Callable[[FloatArray, Indices], Proposal]
 """Maps high-level observations ``(n, high_dim)`` of the environments ``(n,)`` to their next options."""
 
+GivesUp = Callable[[GoalObservation, OptionClock], BoolArray]
+"""Which windows the high level ends before their time, ``(n_envs,)``, at goal observations of all environments."""
+
 Schedule = Callable[[FloatArray, GoalObservation], FloatArray]
 """Appends unit time budgets to unit subgoals ``(n, subgoal_dim)`` chosen at goal observations."""
 
@@ -74,6 +77,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
     :param rules: what ends an option
     :param state_dim: width of the low level's memory to record with each step
     :param schedule: gives the time budgets where the high level does not
+    :param gives_up: which windows the high level ends before their time; None: none of them
     :raises ValueError: if the environments are not goal environments or their actions not a Box
     """
 
@@ -85,6 +89,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         rules: OptionRules,
         state_dim: int = 0,
         schedule: Schedule | None = None,
+        gives_up: GivesUp | None = None,
     ) -> None:
         space = check_goal_space(venv.observation_space, venv.action_space)
         venv = with_episode_limit(venv)
@@ -92,6 +97,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self.high_level, self.views, self.rules, self.schedule = high_level, layout, rules, schedule
         self.clock = OptionClock(venv.num_envs, layout.subgoals, rules)
         self.unit: Any = UnitActions(self.action_space)  # type: ignore[arg-type]
+        self.gives_up = gives_up
         self._everywhere = np.arange(venv.num_envs)
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
         self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
@@ -219,6 +225,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         The last window of an episode ends when the task says that the episode does. It was told when that is to be;
         where wrappers change what it sees, it may be a step late, which the window then lasts longer.
         """
+        if self.gives_up is not None:
+            self.clock.give_up(self.gives_up(seen, self.clock))
         over = self.clock.ended(seen) | dones
         if not np.count_nonzero(over):
             return over
@@ -301,7 +309,9 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         return self.views.low(observation, self.clock.subgoal, remaining)
 
 
-CUT_OFF = (TerminationReason.EPISODE_END.value, TerminationReason.EVENT.value)
+CUT_OFF = tuple(
+    reason.value for reason in (TerminationReason.EPISODE_END, TerminationReason.EVENT, TerminationReason.RECONSIDERED)
+)
 
 
 def _tell_low_level(where: Indices, last: FloatArray, infos: list[Plain]) -> None:

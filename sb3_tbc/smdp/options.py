@@ -17,13 +17,18 @@ class TerminationReason(enum.Enum):
     """What ended an option; stored by name. Whether its subgoal was reached is another question.
 
     ``REACHED`` is an end *before* the time budget, because the subgoal was reached; ``EXPIRED`` the end of the budget,
-    reached or not; ``EPISODE_END`` and ``EVENT`` cut an option off.
+    reached or not; ``EPISODE_END`` and ``EVENT`` cut an option off; ``RECONSIDERED`` is cut off by the high level.
     """
 
     REACHED = "reached"
     EXPIRED = "expired"
     EPISODE_END = "episode_end"
     EVENT = "event"
+    RECONSIDERED = "reconsidered"
+
+
+WINDOW_ENDS = ("timed", "reached", "reconsider")
+"""What may end a window, see :class:`OptionRules`."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,8 @@ class OptionRules:
     :param dt_min: shortest time budget; in ``"reached"`` mode no window ends before it unless the episode does
     :param max_options: high-level decisions allowed per episode; when they are used up the episode ends as a failure
     :param window_end: ``"timed"`` runs every window to the end of its budget (HiTS), ``"reached"`` also ends it when
-        the subgoal is reached (paper, algorithm 1 line 20)
+        the subgoal is reached (paper, algorithm 1 line 20), ``"reconsider"`` also when the high level values a new
+        option more than the rest of this one (see :class:`~sb3_tbc.tbc_hrl.reconsideration.Reconsideration`)
     :param whole_budgets: round time budgets to the nearest whole number of steps, at least 1 (paper section 4.1); else
         a fractional budget lasts until the first whole step that is not shorter
     :raises ValueError: if a number is out of range or ``window_end`` is unknown
@@ -56,8 +62,8 @@ class OptionRules:
             raise ValueError(f"dt_max must allow at least one environment step, got {self.dt_max}; lower max_options?")
         if self.max_options < 1:
             raise ValueError(f"max_options must be at least 1, got {self.max_options}")
-        if self.window_end not in ("timed", "reached"):
-            raise ValueError(f"window_end must be 'timed' or 'reached', got {self.window_end!r}")
+        if self.window_end not in WINDOW_ENDS:
+            raise ValueError(f"window_end must be one of {', '.join(map(repr, WINDOW_ENDS))}, got {self.window_end!r}")
 
     @property
     def dt_ref(self) -> float:
@@ -68,6 +74,11 @@ class OptionRules:
     def ends_when_reached(self) -> bool:
         """Whether a window ends as soon as its subgoal is reached."""
         return self.window_end == "reached"
+
+    @property
+    def may_be_reconsidered(self) -> bool:
+        """Whether the high level may end a window before its time."""
+        return self.window_end == "reconsider"
 
     def completed(self, expired: BoolArray, reached: BoolArray | None, may_end: BoolArray | bool = True) -> BoolArray:
         """Which windows have run to an end of their own, which nothing from outside cut off.
@@ -169,6 +180,7 @@ class OptionClock:
         self.testing = np.zeros(n_envs, dtype=bool)
         self.elapsed = np.zeros(n_envs, dtype=np.int64)
         self.used = np.zeros(n_envs, dtype=np.int64)
+        self._given_up = np.zeros(n_envs, dtype=bool)  # by the high level, after the last step
 
     def begin_episode(self, indices: Indices) -> None:
         """Forget the options used so far in the environments ``indices``."""
@@ -186,6 +198,7 @@ class OptionClock:
         self.testing[indices] = testing
         self.elapsed[indices] = 0
         self.used[indices] += 1
+        self._given_up[indices] = False
 
     def tick(self) -> None:
         """One environment step has passed everywhere."""
@@ -206,13 +219,22 @@ class OptionClock:
         """Whose window is old enough to end by reaching its subgoal, ``(n_envs,)``."""
         return np.asarray(self.elapsed >= self.rules.dt_min)
 
+    @property
+    def may_be_given_up(self) -> BoolArray:
+        """Which windows the high level may end now, ``(n_envs,)``: no test, and not the episode's last."""
+        return np.asarray(self.may_end & ~self.testing & ~self.expired & (self.used < self.rules.max_options))
+
+    def give_up(self, which: BoolArray) -> None:
+        """Let the windows of a mask ``(n_envs,)`` end with the last step."""
+        self._given_up |= which
+
     def ended(self, seen: GoalObservation) -> BoolArray:
-        """Whose window is over, ``(n_envs,)``: by its own rule, or by the task's event.
+        """Whose window is over, ``(n_envs,)``: by its own rule, given up by the high level, or by the task's event.
 
         :param seen: what the last step led to
         """
         reached = self.reached(seen) if self.rules.ends_when_reached else None
-        over = self.rules.completed(self.expired, reached, self.may_end)
+        over = self.rules.completed(self.expired, reached, self.may_end) | self._given_up
         return over if self.subgoals.event is None else over | self.subgoals.happened(seen)
 
     def reached(self, seen: GoalObservation, where: Indices | slice = slice(None)) -> BoolArray:
@@ -227,15 +249,17 @@ class OptionClock:
         :param step: the number of steps of its episode so far
         :param reached: whether its subgoal is reached now
         :param episode_over: whether the episode ends with this step; if not, and the window is not at an end of its
-            own, the task's event ended it
+            own, the high level gave it up or the task's event ended it
         """
         expired, early = self.expired[index], self.may_end[index]
         if expired:
             reason = TerminationReason.EXPIRED
         elif self.rules.completed(expired, np.asarray(reached), early):
             reason = TerminationReason.REACHED
+        elif episode_over:
+            reason = TerminationReason.EPISODE_END
         else:
-            reason = TerminationReason.EPISODE_END if episode_over else TerminationReason.EVENT
+            reason = TerminationReason.RECONSIDERED if self._given_up[index] else TerminationReason.EVENT
         duration = int(self.elapsed[index])
         return Option(
             start=step - duration,

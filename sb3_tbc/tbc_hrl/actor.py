@@ -6,6 +6,7 @@ import numpy as np
 
 from sb3_tbc.arrays import BoolArray, FloatArray
 from sb3_tbc.level.level import SACLevel
+from sb3_tbc.tbc_hrl.reconsideration import Reconsideration
 
 
 class TwoLevelActor:
@@ -17,10 +18,13 @@ class TwoLevelActor:
     :param high: the high level
     :param low: the low level
     :param memory: when the membrane is reset: at each new ``"window"``, ``"episode"``, or at every step (``"none"``)
+    :param reconsideration: lets the high level end windows before their time; None: it does not
     """
 
-    def __init__(self, high: SACLevel, low: SACLevel, memory: str) -> None:
-        self.high, self.low, self.memory = high, low, memory
+    def __init__(
+        self, high: SACLevel, low: SACLevel, memory: str, reconsideration: Reconsideration | None = None
+    ) -> None:
+        self.high, self.low, self.memory, self.reconsideration = high, low, memory, reconsideration
 
     def blank(self, n_envs: int) -> FloatArray:
         """The low level's memory before anything happened, ``(n_envs, state_dim)``."""

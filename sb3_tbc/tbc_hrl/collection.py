@@ -56,7 +56,9 @@ class TwoLevelRunner:
         deterministic: bool = False,
     ) -> None:
         self.actor, self.rng, self.deterministic = actor, rng, deterministic
-        self.env = HierarchicalVecEnv(venv, self.propose, views, rules, actor.low.state_dim, schedule)
+        self.env = HierarchicalVecEnv(
+            venv, self.propose, views, rules, actor.low.state_dim, schedule, actor.reconsideration
+        )
         self.membrane = actor.blank(venv.num_envs)
         self.observation: FloatArray = np.zeros(0)  # the low level's
 

@@ -57,8 +57,12 @@ class AgentConfig(Settings):
 
     max_options: Annotated[int, Range(1, 1_000_000)] | Literal["auto"] = 20
     """High-level decisions allowed per episode; ``auto``: as many as leave ten steps to each, at most 20."""
-    window_end: Literal["timed", "reached"] = "timed"
-    """What ends a window: its time budget alone (HiTS), or reaching the subgoal as well (algorithm 1)."""
+    window_end: Literal["timed", "reached", "reconsider"] = "timed"
+    """What ends a window: its time budget alone (HiTS); reaching the subgoal as well (algorithm 1); or the high level
+    as well, when its critic values a new option more than the rest of this one (arXiv 2211.06351)."""
+    reconsider_margin: Price = 1.0
+    """How much more a new option must be worth to end a window with ``window_end: reconsider``, in the high level's
+    rewards; 1 is the price of a decision."""
     dt_min: NotNegative = 0.0
     """Shortest time budget, environment steps."""
     dt_max: Annotated[float, Range(1, also=(-1,))] = -1.0
@@ -154,6 +158,12 @@ class AgentConfig(Settings):
                 f"of {self.duration_loss_coef} teaches a high level that chooses its time budgets: use "
                 f"duration='joint' (here {self.duration!r}), or 0",
             )
+        if self.window_end == "reconsider" and self.duration != "joint":
+            raise SettingError(
+                "window_end",
+                "of 'reconsider' asks the high level's critic what the rest of a time budget is worth, which it knows "
+                f"only where the high level chooses time budgets: use duration='joint' (here {self.duration!r})",
+            )
         if self.fixed_duration is not None and self.duration != "fixed":
             raise SettingError(
                 "fixed_duration", f"of {self.fixed_duration:g} needs duration='fixed', got duration={self.duration!r}"
@@ -211,7 +221,7 @@ class HiTSConfig(TBCConfig):
 class HACConfig(TBCConfig):
     """HAC: windows end at their subgoal, time is neither chosen nor seen, the low level is an MLP."""
 
-    window_end: Literal["timed", "reached"] = "reached"
+    window_end: Literal["timed", "reached", "reconsider"] = "reached"
     duration: Literal["joint", "rule", "fixed"] = "fixed"
     remaining_time: bool = False
     target: Literal["smdp", "decision"] = "decision"

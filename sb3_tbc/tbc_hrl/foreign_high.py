@@ -34,12 +34,27 @@ class ForeignHigh:
         return np.clip(unit, -1.0, 1.0).astype(np.float32), states
 
 
+def refuse_reconsidering(agent: Any) -> None:
+    """See that the agent's high level can be replaced by another algorithm.
+
+    :param agent: a :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`
+    :raises ValueError: if that high level also ends windows
+    """
+    if agent.rules.may_be_reconsidered:
+        raise ValueError(
+            "with window_end='reconsider' an agent's own high level ends windows, which another algorithm cannot do in "
+            "its place: use an agent with window_end='timed' or 'reached'"
+        )
+
+
 def put_together(high: BaseAlgorithm, low: Any) -> Any:
     """A copy of an agent whose options another algorithm proposes.
 
     :param low: a :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`
-    :raises ValueError: if the algorithm's observations or actions are not those of the agent's high level
+    :raises ValueError: if the algorithm's observations or actions are not those of the agent's high level, or that
+        high level ends windows before their time
     """
+    refuse_reconsidering(low)
     views, space = low.policy.views, low.observation_space
     wanted: tuple[Any, Any] = views.high_space(space), views.high_action_space()
     given = high.observation_space, high.action_space

@@ -15,6 +15,7 @@ from sb3_tbc.arrays import AnyArray, FloatArray
 from sb3_tbc.smdp.episode_limit import ANNOUNCE, LastWindow, with_episode_limit
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
 from sb3_tbc.smdp.options import OptionClock
+from sb3_tbc.tbc_hrl.foreign_high import refuse_reconsidering
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 
 Indices = NDArray[np.intp]
@@ -38,7 +39,8 @@ class OptionEnv(VecEnvWrapper):
     :param agent: gives the low level, and what ends an option; it is used as it is, not trained
     :param deterministic: whether the low level acts by its means
     :param seed: of the low level's noise where it does not
-    :raises ValueError: if ``venv`` is wrapped, or is no vector of goal environments
+    :raises ValueError: if ``venv`` is wrapped, or is no vector of goal environments; if the agent's high level ends
+        windows before their time, which another algorithm cannot do
     """
 
     def __init__(self, venv: VecEnv, agent: TBCHRL, deterministic: bool = True, seed: int | None = None) -> None:
@@ -47,6 +49,7 @@ class OptionEnv(VecEnvWrapper):
                 f"OptionEnv steps each environment by itself, past {type(venv).__name__}: give it the DummyVecEnv or "
                 "SubprocVecEnv itself, and put wrappers around the OptionEnv"
             )
+        refuse_reconsidering(agent)
         space = check_goal_space(venv.observation_space, venv.action_space)
         policy = agent.policy
         super().__init__(

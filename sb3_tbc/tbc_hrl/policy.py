@@ -21,6 +21,7 @@ from sb3_tbc.smdp.options import OptionClock, OptionRules
 from sb3_tbc.smdp.views import LevelViews
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.environment import check_sizes
+from sb3_tbc.tbc_hrl.reconsideration import Reconsideration
 
 
 class TwoLevelState(NamedTuple):
@@ -45,6 +46,7 @@ class TBCPolicy(BasePolicy):
     :param memory: when the membrane is reset: at each new ``"window"``, ``"episode"``, or at every step (``"none"``)
     :param seed: of the noise that ``predict(deterministic=False)`` draws
     :param schedule: gives the time budgets where the high level does not
+    :param reconsider_margin: see :class:`.Reconsideration`, used where the rules let the high level end windows
     """
 
     def __init__(
@@ -58,10 +60,12 @@ class TBCPolicy(BasePolicy):
         memory: str,
         seed: int | None = None,
         schedule: Schedule | None = None,
+        reconsider_margin: float = 1.0,
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.high_policy, self.low_policy = high.policy, low.policy
-        self.actor = TwoLevelActor(high, low, memory)
+        reconsideration = Reconsideration(high, views, rules, reconsider_margin) if rules.may_be_reconsidered else None
+        self.actor = TwoLevelActor(high, low, memory, reconsideration)
         self.views, self.rules, self.memory, self.schedule = views, rules, memory, schedule
         self.unit: Any = UnitActions(action_space)
         self.rng = np.random.default_rng(seed)
@@ -133,6 +137,8 @@ class TBCPolicy(BasePolicy):
 
     def _begin_options(self, clock: OptionClock, batch: Arrays, starts: BoolArray, deterministic: bool) -> BoolArray:
         """Replace the options that are over, in place; which they are."""
+        if self.actor.reconsideration is not None:
+            clock.give_up(self.actor.reconsideration(batch, clock) & ~starts)
         over = starts | clock.ended(batch)
         clock.begin_episode(np.flatnonzero(starts))
         where = np.flatnonzero(over)

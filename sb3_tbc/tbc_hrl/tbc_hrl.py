@@ -183,8 +183,9 @@ class TBCHRL(TwoLevelSaving):
         self.schedule = assembly.make_schedule(config, self.views, self.rules, self.reachability)
         self._make_replay(high_spaces, low_spaces, seeds[3], seeds[4])
         self.policy = TBCPolicy(
-            space, actions, self.high, self.low, self.views, self.rules, config.memory, seeds[5], self.schedule
-        )
+            space, actions, self.high, self.low, self.views, self.rules, config.memory, seeds[5], self.schedule,
+            config.reconsider_margin,
+        )  # fmt: skip
         self.diagnostics = EpisodeDiagnostics()
 
     def _make_replay(self, high_spaces: LevelSpaces, low_spaces: LevelSpaces, high_seed: int, low_seed: int) -> None:
