@@ -8,13 +8,13 @@ from typing import Any
 import gymnasium as gym
 
 Plain = dict[str, Any]
-"""Plain data by name: what JSON and YAML hold, an ``info``, keyword arguments."""
+"""Plain values by name: the content of a JSON or YAML file, the ``info`` of a step, keyword arguments."""
 
 PlainMapping = Mapping[str, Any]
-"""The same, to be read only."""
+"""The same, where it is only read."""
 
 Env = gym.Env[Any, Any]
-"""An environment, whatever it shows and takes."""
+"""An environment, with observations and actions of any type."""
 
 Space = gym.Space[Any]
 """A space of observations or actions."""

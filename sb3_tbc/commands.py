@@ -1,4 +1,4 @@
-"""The commands: which there are, and what they share. A user's mistake is one line and exit status 2."""
+"""The table of commands, and what all commands share: a user's mistake is one line of text and exit status 2."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ COMMANDS = {
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
-    """Help texts that end with the default value, where there is one and the text does not name it."""
+    """Adds the default value to each help text that does not name it already."""
 
     def __init__(self, prog: str) -> None:
         super().__init__(prog, max_help_position=30, width=min(shutil.get_terminal_size().columns, 110))
@@ -97,7 +97,7 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
 
 
 def stop_like_ctrl_c() -> None:
-    """Let a termination signal save the run as Ctrl-C does."""
+    """Treat a termination signal like Ctrl-C, so that the run is saved."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
@@ -106,7 +106,7 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--trust", action="store_true", help="load the agent even if its file can run code on this machine; use it "
         "only for files whose origin you know. Needed for agents of version 0.1, for policy classes of your own, and "
-        "for agents whose environment is in a module of its own",
+        "for environments that are defined in a module of your own",
     )  # fmt: skip
 
 

@@ -15,7 +15,7 @@ class NonFiniteError(FloatingPointError):
 
 
 class ConfigError(ValueError):
-    """A configuration names what does not exist or has the wrong type; the message names the nearest match."""
+    """A name is unknown or a value is not allowed; the message says what is allowed, or names the nearest match."""
 
 
 class WriteError(OSError):
@@ -25,7 +25,7 @@ class WriteError(OSError):
 
 
 class FolderInUseError(ConfigError):
-    """Another process works in the folder."""
+    """Another process is using the folder."""
 
 
 class EnvironmentFault(RuntimeError):
@@ -33,11 +33,11 @@ class EnvironmentFault(RuntimeError):
 
 
 class DivergedError(ArithmeticError):
-    """Learning left all sense: losses or weights grew without bound."""
+    """Learning diverged: losses or weights grew without bound."""
 
 
 class TrainingError(RuntimeError):
-    """Training ended early; the message says why, and from where it can go on. The reason is the error's cause."""
+    """Training ended early; the message says why and how to continue. The original error is the ``__cause__``."""
 
 
 def nearest(name: str, names: Iterable[str]) -> str:

@@ -50,7 +50,7 @@ def build_parser() -> Parser:
 
 
 def identify(path: Path, env: str | None, trust: bool = False) -> Plain:
-    """What the ``.zip`` says of itself, and the environment to evaluate it on.
+    """What an agent's ``.zip`` records about the agent, and the environment to evaluate it on.
 
     :param path: the agent
     :param env: environment asked for, or ``None`` for the agent's own
@@ -119,7 +119,7 @@ FIGURES = {
 def command(argv: Sequence[str]) -> int:
     """Evaluate; see ``--help``."""
     args = build_parser().parse_args(argv)
-    if args.video is not None:  # told before the episodes are counted, which may take minutes
+    if args.video is not None:  # checked first, since counting the episodes may take minutes
         require("imageio", extra="video", what="a film")
     th.set_num_threads(args.num_threads)
     info = identify(args.model, args.env, args.trust)
@@ -144,7 +144,7 @@ def command(argv: Sequence[str]) -> int:
 
 
 def _tell(result: PlainMapping, json_out: str | None) -> None:
-    """Print the summary; with ``--json``, standard output is exactly the JSON and the summary goes beside it."""
+    """Print the summary; with ``--json``, standard output has the JSON alone, the summary goes to standard error."""
     if json_out is None:
         print(describe(result))
         return

@@ -1,4 +1,4 @@
-"""Optional packages: one place that says which extra of ``sb3_tbc`` brings a package that is not there."""
+"""Optional packages: import one, or say which extra of ``sb3_tbc`` installs it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writing files so that no reader, crash, full disk or power cut ever leaves half of one."""
+"""Atomic writing: no crash, full disk or power cut leaves half a file, and no reader sees one."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def sync(path: Path) -> None:
 
 @contextlib.contextmanager
 def explained(path: Path) -> Iterator[None]:
-    """Turn whatever a failed write raises within into a :class:`.WriteError` about ``path``.
+    """Turn any error of a write within the block into a :class:`.WriteError` about ``path``.
 
     :param path: what is written
     :raises WriteError: naming the path, the reason and the likely cure
@@ -56,7 +56,7 @@ def explained(path: Path) -> Iterator[None]:
 
 
 def _system_error(error: BaseException | None) -> OSError | None:
-    """The system's own error behind what torch or NumPy made of it; None if there is none."""
+    """The operating system's error that caused one of torch or NumPy; None if there is none."""
     while error is not None:
         if isinstance(error, OSError) and error.errno is not None:
             return error
@@ -75,11 +75,11 @@ def _reason(error: OSError) -> str:
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside ``path``: what is written there takes the place of ``path`` when the block ends well.
+    """Give a temporary path beside ``path``; the file written there replaces ``path`` if the block ends without error.
 
-    The content is on the disk before it gets its name, and so is the name before this returns.
+    The content is on the disk before the file gets its name, and the name is on the disk when the block is left.
 
-    :raises WriteError: if it cannot be written; what was at ``path`` is untouched then
+    :raises WriteError: if the file cannot be written; what was at ``path`` is then untouched
     """
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_atomic(path: Path, text: str) -> None:
-    """Write a text file so that a reader or a crash never sees half of it; characters no file can hold are escaped.
+    """Write a text file atomically; characters that UTF-8 cannot encode are escaped.
 
     :raises WriteError: if it cannot be written
     """
@@ -113,7 +113,7 @@ def save_atomic(save: Callable[[str], object], path: Path) -> None:
 
 
 def write_arrays(path: str | Path | io.BufferedIOBase, arrays: PlainMapping) -> None:
-    """Write plain arrays to one file, atomically where ``path`` is a path, whose folder is made as SB3 does.
+    """Write plain arrays to one file. A path is written atomically, and its folder is made if it is missing.
 
     :raises WriteError: if it cannot be written
     """
@@ -151,9 +151,9 @@ def remove_temporary(folder: Path) -> None:
 
 @contextlib.contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, made if need be, for this process alone.
+    """Lock a folder for this process; the folder is made if it is missing.
 
-    The lock ends with the process, however that ends, so there are no stale ones.
+    The lock ends with the process, however the process ends, so no stale lock is left behind.
 
     :raises FolderInUseError: if another process holds it
     :raises WriteError: if the folder cannot be made or written to
@@ -169,7 +169,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def _take(path: Path) -> int:
-    """A handle that holds the lock; the file must still have its name then, or its holder has just let go of it."""
+    """A handle that holds the lock. If the former holder removed the file in the meantime, the next one is tried."""
     while True:
         handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
         try:

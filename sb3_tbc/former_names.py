@@ -1,7 +1,7 @@
 """Modules that have moved: their former names still import, and agents saved under those names still load.
 
-A saved agent names the classes it needs by module. Each former name gives the very module it has become, so a class has
-one identity whichever name it was imported by.
+A saved agent names the classes it needs by module. A former name gives the same module object as the present name, so
+that each class exists once, whichever name it was imported by.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ FORMER_NAMES = {
 
 
 class FormerNames(MetaPathFinder, InspectLoader):
-    """Finds a module under its former name; imports nothing until then."""
+    """Finds modules under their former names; a module is imported when it is asked for, not before."""
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
-        """The import system's question; None for every other name."""
+        """Called by the import system; None for a name that is not a former one."""
         if fullname not in FORMER_NAMES:
             return None
         present = importlib.util.find_spec(FORMER_NAMES[fullname])
@@ -76,7 +76,7 @@ class FormerNames(MetaPathFinder, InspectLoader):
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """It ran when it was imported; only what the import system wrote over it is put back."""
+        """Run nothing, since the module ran when it was imported; put back what the import system has overwritten."""
         written: Any = module.__spec__
         module.__spec__, module.__loader__ = written.loader_state
 

@@ -1,4 +1,4 @@
-"""Names, numbers and URLs that come from outside: one function for each, which all that write or show them use."""
+"""Names, numbers and URLs that come from outside: the functions that check them, or make them safe to show."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ HIDDEN = "***"
 
 
 def folder_name(text: str, what: str) -> str:
-    """A text as the name of one folder, unchanged; slashes and dots must not lead out of the folder it lies in.
+    """Check that a text can be the name of one folder and return it; slashes and dots must not lead elsewhere.
 
     :param text: the name
     :param what: what it names, for messages
-    :raises ConfigError: if it is no name of a folder everywhere, with what is allowed
+    :raises ConfigError: if some system does not allow it as a folder's name; the message says what is allowed
     """
     if not isinstance(text, str):
         raise ConfigError(f"{what} must be a text, got {text!r}; put quotes around it in YAML")
@@ -37,13 +37,13 @@ def folder_name(text: str, what: str) -> str:
 def flat_name(text: str, what: str) -> str:
     """An environment id or task as the name of a folder: its slashes and colons become underscores.
 
-    :raises ConfigError: if it is no name even then
+    :raises ConfigError: if it is not a folder's name even then
     """
     return folder_name(text.replace("/", "_").replace(":", "_") if isinstance(text, str) else text, what)
 
 
 def number(value: Any, what: str, low: float = -math.inf, high: float = math.inf) -> float:
-    """A finite number within bounds; texts and truth values are none, whatever they look like.
+    """Check that a value is a finite number within bounds; text and truth values are refused.
 
     :param value: as JSON or YAML gave it
     :param what: what it is, for messages
@@ -57,21 +57,21 @@ def number(value: Any, what: str, low: float = -math.inf, high: float = math.inf
 
 
 def one_line(text: object, longest: int = 300) -> str:
-    """A foreign message in one line of printable characters, cut where it is too long."""
+    """A message from elsewhere as one line of printable characters, cut if it is too long."""
     line = " ".join("".join(c if c.isprintable() or c.isspace() else f"\\x{ord(c):02x}" for c in str(text)).split())
     return line if len(line) <= longest else f"{line[: longest - 3]}..."
 
 
 def in_docstring(text: str) -> str:
-    """A text within the docstring of a module that is written: nothing in it ends the string or escapes from it."""
+    """Escape a text for the docstring of a generated module, so that nothing in it can end the string."""
     return one_line(text).replace("\\", "\\\\").replace('"', '\\"').encode("ascii", "backslashreplace").decode()
 
 
 def without_password(url: str) -> str:
-    """A storage's name without its password, wherever one stands, in a mistyped URL too.
+    """A storage's URL with its password hidden, even if the URL is mistyped.
 
-    Rather more is hidden than too little: all between the account's first colon and the last ``@``, every query and
-    fragment that speaks of a secret, and the whole of a connection string made of such parts.
+    In doubt, more is hidden than needed: everything between the account's first colon and the last ``@``, and the value
+    of each part of a query, fragment or connection string whose name means a secret.
     """
     head, mark, tail = re.match(r"([^?#]*)([?#]?)(.*)", url, re.DOTALL).groups()  # type: ignore[union-attr]
     scheme, head = _split_scheme(head)
@@ -110,5 +110,5 @@ def _looks_like_host(head: str) -> bool:
 
 
 def _hide_secrets(text: str) -> str:
-    """Hide what follows a name that speaks of a secret, up to the next part of a query."""
+    """Hide the value after each name that means a secret, such as ``password``."""
     return SECRET.sub(rf"\g<1>{HIDDEN}", text)

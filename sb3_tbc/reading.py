@@ -1,4 +1,4 @@
-"""Text files from outside: read within limits, and every way in which one can be wrong is one kind of error."""
+"""Reading files from outside within limits; whatever is wrong with a text file is a :class:`.ConfigError`."""
 
 from __future__ import annotations
 
@@ -18,12 +18,14 @@ from sb3_tbc.outside import one_line
 MAX_BYTES = 4 * 2**20
 """Largest text file that is read; configurations have some 10,000 bytes."""
 MAX_VALUES = 100_000
-"""Values that a YAML text may hold when its aliases are written out; a few hundred bytes can mean billions."""
+"""Most values of a YAML text once its aliases are written out; without a limit, a few bytes could mean billions."""
 MAX_DEPTH = 50
 UNNAMED = ' in "<unicode string>"'
 MAX_GROWTH = 2000
 SMALL = 2**26
-"""A file of arrays may unpack to so many times its size, and this much more: replay is full of equal rows."""
+"""Most bytes that a file of arrays may unpack to: ``MAX_GROWTH`` times its size plus ``SMALL``. The factor is large
+because an empty replay buffer is all zeros.
+"""
 
 
 def read_text(path: Path) -> str:
@@ -101,7 +103,7 @@ def _size(node: yaml.Node, known: dict[int, int], depth: int) -> int:
         raise ConfigError("cannot read YAML: nested too deeply")
     if id(node) in known:
         if known[id(node)] < 0:
-            raise ConfigError("cannot read YAML: an alias refers to what it lies in")
+            raise ConfigError("cannot read YAML: an alias refers to a node that contains it")
         return known[id(node)]
     known[id(node)] = -1
     inner = node.value if isinstance(node, yaml.CollectionNode) else []
@@ -117,7 +119,7 @@ def read_arrays(path: Any) -> Arrays:
     """The arrays of a file that :func:`~sb3_tbc.files.write_arrays` wrote; nothing is unpickled.
 
     :param path: of the file, or an open file
-    :raises ValueError: if it is damaged, holds other things than plain arrays, or would unpack to far more than it is
+    :raises ValueError: if it is damaged, holds other things than plain arrays, or unpacks to far more than its size
     """
     try:
         with zipfile.ZipFile(path) as archive:

@@ -42,7 +42,7 @@ def build_parser() -> Parser:
     add("--tasks", nargs="+", default=sorted(task_names()), help="by default all of them")
     add("--algos", nargs="+", default=sorted(ALGORITHMS), help="by default all of them: hac, hits, sac, tbc-hrl")
     add("--seeds", type=positive_int, default=10, help="seeds of each task and method; the paper has 10")
-    add("--first-seed", type=int, default=0, help="the seeds are this one and the next ones")
+    add("--first-seed", type=int, default=0, help="the first seed; the others are the numbers that follow it")
     add(
         "--config",
         choices=CONFIGS,
@@ -50,12 +50,12 @@ def build_parser() -> Parser:
     )
     add("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
     add("--variant", help="name of the runs' folder; by default from --config and --ablation")
-    add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as train takes them")
+    add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as in sb3_tbc.train")
     add("--n-timesteps", type=positive_int, help="environment steps of each run; by default the task's")
-    add("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a fortieth")
+    add("--eval-freq", type=positive_int, help="steps between evaluations; by default a fortieth of the run")
     add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (default: 20)")
     add("--n-final-episodes", type=positive_int, default=100, help="episodes of the evaluation after training")
-    add = parser.add_argument_group("how they are run").add_argument
+    add = parser.add_argument_group("how the runs are carried out").add_argument
     add("--workers", type=positive_int, default=1, help="runs at the same time, one thread each")
     add("--executor", choices=["local", "slurm", "ray"], default="local", help="local: processes on this machine; "
         "slurm, ray: a cluster whose machines all see the folders below (extra cluster)")  # fmt: skip

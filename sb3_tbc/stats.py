@@ -49,13 +49,15 @@ class Spread(NamedTuple):
 
 
 FEWEST_SEEDS = 3
-"""With fewer the paper bootstraps episodes (section 5.1); that says nothing of other seeds, so nothing is tested."""
+"""Fewest seeds for a test. With fewer, the paper bootstraps episodes (section 5.1), which says nothing about other
+seeds; so no test is made.
+"""
 NO_VARIANCE = "no variance"
 TOO_FEW_SEEDS = "fewer than three seeds"
 
 
 def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's score interval of a success rate; honest at 0 and 1 and with few episodes.
+    """Wilson's score interval of a success rate; valid near 0 and 1 and with few episodes, too.
 
     :param successes: episodes that succeeded
     :param trials: episodes
@@ -68,7 +70,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Exact interval of a success rate; it covers the truth at least as often as it says.
+    """Exact interval of a success rate: it holds the true rate at least as often as its confidence says.
 
     :param successes: episodes that succeeded
     :param trials: episodes
@@ -257,8 +259,9 @@ def spread(values: ArrayLike) -> Spread:
 def difference(first: Interval, second: Interval) -> Interval:
     """Difference of two means and its interval, from the intervals of both (Newcombe's method of combining limits).
 
-    The lower end lies as far out as the first's lower and the second's upper limit together allow, in quadrature; so
-    the interval has no width zero where its parts have none.
+    The distance from the difference to its lower end is the root of the summed squares of two distances: from the
+    first mean to its lower limit, and from the second mean to its upper limit; likewise for the upper end. So the width
+    is zero only if both intervals have width zero.
     """
     mean = first.mean - second.mean
     low = mean - np.hypot(first.mean - first.low, second.high - second.mean)
@@ -291,7 +294,7 @@ def compare(first: Mapping[Key, ArrayLike], second: Mapping[Key, ArrayLike]) -> 
 
 
 def stability(success_rates: Sequence[float], threshold: float = 0.9) -> tuple[float, float] | None:
-    """Share of evaluations at or above ``threshold`` from the first such one on, and the worst of them.
+    """Share of evaluations at or above ``threshold``, counted from the first such one, and the lowest rate from there.
 
     :return: ``None`` if the threshold was never met
     """

@@ -1,4 +1,4 @@
-"""Stopping when asked: a signal sets a flag, and the work stops at its next point from which it can go on exactly."""
+"""Stopping on a signal: it sets a flag, and the work stops at the next point from which it can be resumed exactly."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 
 
 class StopRequest:
-    """Whether this process was asked to stop; true once and for all."""
+    """Whether this process was asked to stop; once true, it stays true."""
 
     def __init__(self) -> None:
         self.signal: str | None = None
         self._tell: Callable[[], None] | None = None
 
     def calls(self, tell: Callable[[], None]) -> None:
-        """Call something when a stop is asked for, or now if it was already: it may only set a flag."""
+        """Register what to call on a request to stop (at once if there was one already); it may only set a flag."""
         self._tell = tell
         if self:
             tell()
@@ -30,7 +30,7 @@ class StopRequest:
         return self.signal is not None
 
     def ask(self, number: int, frame: FrameType | None = None) -> None:
-        """Take note of a signal; a further one changes nothing, so that an impatient second Ctrl-C loses nothing."""
+        """Record a signal. Further ones change nothing, so that an impatient second Ctrl-C loses no work."""
         again, self.signal = self.signal is not None, signal.Signals(number).name
         if self._tell is not None:
             self._tell()
@@ -38,7 +38,7 @@ class StopRequest:
             print(
                 f"\n{self.signal}: stopping already; `kill -9` ends it without saving"
                 if again
-                else f"\n{self.signal}: stopping as soon as all is at a point to go on from",
+                else f"\n{self.signal}: stopping at the next point from which the run can be resumed",
                 file=sys.stderr,
                 flush=True,
             )

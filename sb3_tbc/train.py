@@ -125,7 +125,7 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
 def config_and_file(args: argparse.Namespace) -> tuple[str | None, Path | None]:
     """Which values (``paper`` or ``tuned``) of which file; ``--config`` may name either.
 
-    :raises ConfigError: if it is neither, or a second file
+    :raises ConfigError: if it is neither, or if two files are named
     """
     if args.config is None or args.config in CONFIGS:
         return args.config, args.config_file
@@ -168,7 +168,7 @@ def command(argv: Sequence[str]) -> int:
     if args.help_settings:
         print(settings_text(args.algo.lower()))
         return 0
-    if args.tensorboard:  # told before the run's folder is made
+    if args.tensorboard:  # checked before the run's folder is made
         require("tensorboard", extra="plots", what="--tensorboard")
     with stop_request() as stop:
         return _train(args, argv, stop)

@@ -51,7 +51,7 @@ def main() -> int:
 
 def ablation(task: str, runs: Path) -> Path:
     """The agent of a task's finished MLP run."""
-    folder = RunFolder.of(runs, task, "tbc-hrl", "no-ndbc", 7)
+    folder = RunFolder.for_run(runs, task, "tbc-hrl", "no-ndbc", 7)
     if not (folder.path / "final.json").is_file():
         start = ["--env", task, "--ablation", "no-ndbc", "--seed", "7", "--log-folder", str(runs)]
         if status := train.main([*start, "--n-timesteps", str(MLP[task])]):

@@ -86,7 +86,8 @@ def describe_goal_env(
         raise ValueError(f"{name_of(env)} cannot be used as a goal environment: {error}") from error
     goals = np.concatenate([probe.seen["achieved_goal"], probe.seen["desired_goal"]])
     if given is None:
-        found = tolerances_of(success_test.of(env), probe.seen["desired_goal"], high - low, quaternions(goals))
+        test = success_test.function_for(env)
+        found = tolerances_of(test, probe.seen["desired_goal"], high - low, quaternions(goals))
         given = space(**found._asdict())
     steps = time_limit(env)
     assert steps is not None  # checked by check_goal_env
@@ -150,7 +151,7 @@ class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
 
     def _reached(self, achieved: ArrayLike, desired: ArrayLike) -> NDArray[np.bool_]:
         one, other = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
-        success = self.description.success_test.of(self.env)(np.atleast_2d(one), np.atleast_2d(other))
+        success = self.description.success_test.function_for(self.env)(np.atleast_2d(one), np.atleast_2d(other))
         return success if one.ndim > 1 else success[0]
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from operator import attrgetter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Env
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
 from .probe import Floats, Probe
@@ -30,8 +30,8 @@ class SuccessTest(NamedTuple):
     worst: float | None = None  # the reward elsewhere, where it is the same everywhere else
     near: SubgoalSpace | None = None  # its thresholds, as the user gave them; without these two the reward says it
 
-    def of(self, env: gym.Env[Any, Any]) -> Test:
-        """The test, to be asked of an environment."""
+    def function_for(self, env: Env) -> Test:
+        """The test as a function that asks an environment."""
         if self.near is not None:
             return self.near.reached
         if self.own is None:
@@ -43,13 +43,13 @@ class SuccessTest(NamedTuple):
         return lambda achieved, desired: np.array([bool(own(a, d)) for a, d in zip(achieved, desired, strict=True)])
 
 
-def compute_reward_of(env: gym.Env[Any, Any]) -> Callable[[Floats, Floats], Floats]:
+def compute_reward_of(env: Env) -> Callable[[Floats, Floats], Floats]:
     """The reward of achieved and desired goals ``(n, goal_dim)``, asked as training asks it: without a step's info."""
     compute = env.get_wrapper_attr("compute_reward")
     return lambda achieved, desired: np.asarray(compute(achieved.copy(), desired.copy(), {}), dtype=np.float64)
 
 
-def success_test_of(env: gym.Env[Any, Any], probe: Probe, near: SubgoalSpace | None, seed: int = 0) -> SuccessTest:
+def success_test_of(env: Env, probe: Probe, near: SubgoalSpace | None, seed: int = 0) -> SuccessTest:
     """Find out when a task calls a goal reached.
 
     A reward of two values is its own test: the higher one is paid at the goal. A dense reward does not tell, so that
@@ -71,7 +71,7 @@ def success_test_of(env: gym.Env[Any, Any], probe: Probe, near: SubgoalSpace | N
     if len(values) == 1:
         raise ValueError(f"its reward is {best:.6g} for every observed pair of goals, as if all goals were the same")
     found = SuccessTest(best, worst=float(values[0])) if len(values) == 2 else _own_test(env, best, probe, near)
-    wrong = 0 if found.near else _disagreements(found.of(env), probe)
+    wrong = 0 if found.near else _disagreements(found.function_for(env), probe)
     if wrong:
         raise ValueError(
             f"its info says otherwise than its {found.own or 'reward'} whether the goal is reached, in {wrong} of "
@@ -109,7 +109,7 @@ def _pairs(probe: Probe, rng: np.random.Generator, n: int = 1000) -> tuple[Float
     return np.concatenate([achieved[i], achieved[i]]), np.concatenate([desired[j], achieved[k]])
 
 
-def _own_test(env: gym.Env[Any, Any], best: float, probe: Probe, near: SubgoalSpace | None) -> SuccessTest:
+def _own_test(env: Env, best: float, probe: Probe, near: SubgoalSpace | None) -> SuccessTest:
     """The success test of a task with a dense reward.
 
     :raises ValueError: if it has none
@@ -120,9 +120,9 @@ def _own_test(env: gym.Env[Any, Any], best: float, probe: Probe, near: SubgoalSp
             attrgetter(name)(env.unwrapped)
         except AttributeError:
             continue
-        singly = SuccessTest(best, name, False).of(env)(*some)
+        singly = SuccessTest(best, name, False).function_for(env)(*some)
         try:
-            vectorised = np.array_equal(SuccessTest(best, name).of(env)(*some), singly)
+            vectorised = np.array_equal(SuccessTest(best, name).function_for(env)(*some), singly)
         except Exception:  # A function of the task's own may fail in any way on a batch.
             vectorised = False
         return SuccessTest(best, name, vectorised)

@@ -37,18 +37,18 @@ ACTIONS: dict[str, tuple[str, ...]] = {
 }
 
 
-def input_names(task: str, layout: LevelViews) -> tuple[str, ...]:
+def input_names(task: str, views: LevelViews) -> tuple[str, ...]:
     """A name for each sensory neuron: local state, subgoal, remaining time.
 
     :param task: short name; the local state of a task that is not known here is numbered
-    :param layout: of the agent
+    :param views: of the agent
     """
-    subgoals = layout.subgoals
+    subgoals = views.subgoals
     known = SENSES.get(task, ())
     senses = known if len(known) == subgoals.local_dim else tuple(f"state {i}" for i in range(subgoals.local_dim))
-    to = "to" if layout.relative_subgoals else "subgoal"
+    to = "to" if views.relative_subgoals else "subgoal"
     asked = tuple(f"{to} {name.replace('_', ' ')}" for name in subgoals.names)
-    return (*senses, *asked, *(("time left",) if layout.remaining_time else ()))
+    return (*senses, *asked, *(("time left",) if views.remaining_time else ()))
 
 
 def action_names(task: str, n_actions: int) -> tuple[str, ...]:

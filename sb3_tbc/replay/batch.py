@@ -1,4 +1,4 @@
-"""Named tuples that cross the borders between modules."""
+"""The form of a replay sample."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ class SubgoalReplayBuffer(RingBuffer):
         buffer_size: int,
         observation_space: spaces.Box,
         action_space: spaces.Box,
-        layout: LevelViews,
+        views: LevelViews,
         rules: OptionRules,
         state_dim: int,
         gamma: float,
@@ -145,7 +145,7 @@ class SubgoalReplayBuffer(RingBuffer):
                 f"sequence_length={sequence_length} recomputes the low level's memory, but it has none: use "
                 "sequence_length=1, or a circuit (low.policy_kwargs.ndbc)"
             )
-        subgoals = layout.subgoals
+        subgoals = views.subgoals
         widths = {
             "local": subgoals.local_dim,
             "next_local": subgoals.local_dim,
@@ -164,7 +164,7 @@ class SubgoalReplayBuffer(RingBuffer):
         if reach_pairs:
             widths["to_end"] = 1
         super().__init__(buffer_size, observation_space, action_space, widths, device, seed)
-        self.layout, self.rules, self.gamma = layout, rules, gamma
+        self.views, self.rules, self.gamma = views, rules, gamma
         self.reward = reward or LowLevelReward("sparse", subgoals, rules)
         self.hindsight, self.n_hindsight_goals, self.sequence_length = hindsight, n_hindsight_goals, sequence_length
         self.advance = advance
@@ -179,10 +179,10 @@ class SubgoalReplayBuffer(RingBuffer):
     def sample_pairs(self, n: int, horizon: int, rng: np.random.Generator) -> ReachPairs:
         """Uniformly drawn steps, and a uniformly drawn one of the up to ``horizon`` points reached from there on.
 
-        The label is the step at which that point was first reached, within the subgoal's thresholds: on a way that
-        comes back to a point, the later visits say nothing of how far it is.
+        The label is the step at which that point was first reached, within the subgoal's thresholds: if a path returns
+        to a point, the later visits do not tell how far away it is.
 
-        :param rng: draws them, so that the sampling of transitions stays what it is without them
+        :param rng: random numbers of this draw alone, so that it does not change how transitions are sampled
         """
         data = self.data
         at = rng.integers(0, self.size(), n)
@@ -192,7 +192,7 @@ class SubgoalReplayBuffer(RingBuffer):
         steps = rng.integers(0, np.minimum(ahead, horizon)) + 1
         goal = data["achieved"][(at + steps - 1) % self.buffer_size]
         way = data["achieved"][(at[:, None] + np.arange(steps.max())) % self.buffer_size]
-        first = self.layout.subgoals.reached(way, goal[:, None]).argmax(axis=1) + 1  # the goal itself is on the way
+        first = self.views.subgoals.reached(way, goal[:, None]).argmax(axis=1) + 1  # the goal itself is on the way
         return ReachPairs(data["local"][at], data["here"][at], goal, first.astype(np.float32))
 
     def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
@@ -209,11 +209,11 @@ class SubgoalReplayBuffer(RingBuffer):
         rewards[where, 0], dones[where, 0] = self._relabelled(here[where], achieved[where], subgoal[where], expired)
         scale = np.float32(1.0 / self.rules.dt_max)
         now, later = (np.clip(t * scale, 0.0, 1.0) for t in (time_left, time_left - 1.0))
-        observations = self.layout.low_from(taken["local"], here, subgoal, now)
+        observations = self.views.low_from(taken["local"], here, subgoal, now)
         return (
             observations,
             taken["actions"],
-            self.layout.low_from(taken["next_local"], achieved, subgoal, later),
+            self.views.low_from(taken["next_local"], achieved, subgoal, later),
             rewards,
             dones,
             np.full_like(rewards, self.gamma),
@@ -270,14 +270,14 @@ class SubgoalReplayBuffer(RingBuffer):
             rows = np.flatnonzero(back >= steps)
             earlier = (at[rows] - steps) % self.buffer_size
             left = np.clip((taken["time_left"][rows] + steps) / np.float32(self.rules.dt_max), 0.0, 1.0)
-            seen = self.layout.low_from(
+            seen = self.views.low_from(
                 self.data["local"][earlier], self.data["here"][earlier], taken["subgoal"][rows], left
             )
             states[rows] = self.advance(seen, states[rows])
         return states, self.advance(observations, states)
 
     def _intact(self, begin: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which windows still have all their rows: the one being overwritten at the write position has not."""
+        """Which windows still have all their rows; the one at the write position is partly overwritten."""
         if not self.full:
             return np.ones(len(begin), dtype=bool)
         offset = (begin - self.pos) % self.buffer_size  # rows between the oldest row and the window's first

@@ -20,8 +20,8 @@ from sb3_tbc.replay.batch import LevelBatch
 class RingBuffer(BaseBuffer):
     """A ring of rows. A row's quantities lie side by side: a draw reads one place of the memory, not a dozen.
 
-    The memory is asked for at once; the system hands it out as rows are written. SB3's ``SAC.train`` can sample from
-    it as from any replay buffer; :meth:`sample_burst` is the fast way.
+    The memory is reserved at once; the system assigns it as rows are written. SB3's ``SAC.train`` can sample from it
+    as from any replay buffer; :meth:`sample_burst` is the fast way.
 
     :param buffer_size: rows to keep; the oldest are overwritten
     :param seed: seed of the sampling

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 
 class Domain(Protocol):
-    """What a value of the right type has to fulfil besides."""
+    """A condition that a value of the right type must meet as well."""
 
     def holds(self, value: Any) -> bool:
         """Whether the value is allowed."""
@@ -83,7 +83,7 @@ class Prefixed:
 
 @dataclass(frozen=True)
 class Increasing:
-    """Numbers of which each is larger than the one before it."""
+    """Numbers in rising order, each larger than the one before it."""
 
     def holds(self, value: Any) -> bool:
         """Whether a sequence rises."""

@@ -43,7 +43,7 @@ class Settings:
     """Base of all settings: checks every field when it is made, and knows its plain data."""
 
     def __post_init__(self) -> None:
-        """Check and normalise every field, then what several fields say together."""
+        """Check and normalise every field, then check the fields against each other."""
         for field, hint in zip(dataclasses.fields(self), hints(type(self)).values(), strict=True):
             default = default_of(field)
             object.__setattr__(self, field.name, read(getattr(self, field.name), hint, field.name, default))
@@ -85,13 +85,13 @@ def plain(value: Any) -> Any:
 
 
 def read(value: Any, hint: Any, name: str, default: Any = None, partial: bool = False) -> Any:
-    """A value as its type wants it: whole floats as integers, lists as tuples, mappings as settings.
+    """Check a value and convert it to its type: whole floats to integers, lists to tuples, mappings to settings.
 
     :param value: what was given
     :param hint: the type, with its domains
     :param name: dotted name, for messages
-    :param default: what None stands for where the type has no None; and the settings that a mapping departs from
-    :param partial: leave sections the mappings they are: check what they hold, add nothing
+    :param default: the value for None, where the type does not allow None; or the settings that a mapping changes
+    :param partial: check what sections hold, but leave them mappings and add no defaults
     :raises SettingError: naming the setting, what is allowed and what was given
     """
     kind, domains = split(hint)
@@ -114,7 +114,7 @@ def read_partial(given: Any, kinds: PlainMapping, where: str = "") -> Plain:
     :param given: values by name
     :param kinds: every name there is, and its type
     :param where: section they stand in, for messages
-    :return: the same values, numbers as their types want them
+    :return: the same values, numbers converted to their types
     :raises SettingError: on an unknown name or a value that is not allowed
     """
     _check_names(given, kinds, where)

@@ -30,7 +30,7 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def split(hint: Any) -> tuple[Any, tuple[Domain, ...]]:
-    """A type without and with what restricts it."""
+    """The type itself, and the domains that restrict it."""
     if get_origin(hint) is Annotated:
         kind, *domains = get_args(hint)
         return kind, tuple(domains)
@@ -38,7 +38,7 @@ def split(hint: Any) -> tuple[Any, tuple[Domain, ...]]:
 
 
 def allows_none(kind: Any) -> bool:
-    """Whether None is a value of its own for a type."""
+    """Whether a type allows None as a value."""
     return kind is Any or kind is type(None) or any(arm is type(None) for arm in arms(kind))
 
 

@@ -19,10 +19,10 @@ from sb3_tbc.settings.texts import describe
 
 @dataclass(frozen=True)
 class Entry:
-    """A setting as a reader meets it.
+    """One setting, described for a reader.
 
     :param name: dotted name, e.g. ``low.gamma``
-    :param allowed: what it may be, in words
+    :param allowed: which values it may have, in words
     :param default: its default, as YAML would have it; None for a section
     :param text: what it does
     """
@@ -80,9 +80,9 @@ def _help_texts(section: type[Any]) -> dict[str, str]:
 
 
 def help_texts(section: type[Any]) -> dict[str, str]:
-    """What stands below each field, or in the class's docstring as ``:param field:``, on one line.
+    """Help text of each field on one line: the string below the field, or ``:param field:`` of the class's docstring.
 
-    Base classes are included. There are no texts where there is no source.
+    Base classes are included. Without source code there are no texts.
     """
     key: Any = section
     return _help_texts(key)

@@ -49,6 +49,6 @@ def section_text(kinds: PlainMapping) -> str:
 
 
 def remark(value: Any, kind: Any) -> str:
-    """Say so where a value looks right but is of another type."""
+    """A remark for a text where a number is wanted: the two look alike in a message."""
     wants_number = kind in (int, float) or any(split(arm)[0] in (int, float) for arm in arms(kind))
     return " (text)" if isinstance(value, str) and wants_number else ""

@@ -1,8 +1,8 @@
-"""Ends an episode when the high level's decisions are used up, where every other end of an episode comes from.
+"""Lets the environment itself end an episode when the high level's decisions are used up.
 
-The agent alone knows when that is, but everything that watches episodes (``Monitor``, ``VecMonitor``, any wrapper)
-has to see it as an ordinary truncation. So the agent announces the last window of an episode when it begins, and the
-environment itself truncates the step that ends it.
+Only the agent knows when that is, but everything that watches episodes (``Monitor``, ``VecMonitor``, any wrapper) has
+to see an ordinary truncation. So the agent announces the last window of an episode when the window begins, and the
+environment truncates the step that ends it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class LastWindow(NamedTuple):
     :param steps: environment steps until its time budget is spent
     :param subgoals: to see whether it ends earlier; None: it runs to the end of its budget
     :param subgoal: what was asked for; None where reaching it does not end the window
-    :param not_before: the first of its coming steps that reaching the subgoal may end
+    :param not_before: number of the first step, counted from 1, at which reaching the subgoal may end it
     """
 
     steps: int
@@ -47,8 +47,9 @@ class LastWindow(NamedTuple):
     not_before: int = 1
 
     def over(self, passed: int, seen: GoalObservation) -> bool:
-        """Whether the window is over after so many of its coming steps.
+        """Whether the window is over.
 
+        :param passed: number of its steps so far
         :param seen: what the last of them led to
         """
         if passed >= self.steps or self.subgoals is None:
@@ -61,7 +62,7 @@ class LastWindow(NamedTuple):
 
 
 class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
-    """Truncates the step that ends the last window which the agent announced, and refuses what no step may give.
+    """Truncates the step that ends the announced last window; refuses observations and infos of the wrong form.
 
     :param env: the task itself; wrappers belong around this one, so that they see the end of the episode
     :param index: its number in the vector, for messages
@@ -92,7 +93,7 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, Plain]:
-        """Step; the last observation of an episode is a copy, as some environments write into the same arrays again.
+        """Step; the last observation of an episode is copied, as some environments reuse their arrays.
 
         :raises EnvironmentFault: if the task's own code fails, naming environment and step
         :raises ValueError: if the observation is not of the shape that its space says
@@ -138,10 +139,10 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
 
 
 class CopyableVecEnvWrapper(VecEnvWrapper):
-    """A wrapper that can be copied and pickled: SB3's holds all that its class inherits, much of which cannot be."""
+    """A wrapper that can be copied and pickled. SB3's cannot: it keeps a table of all attributes of its class."""
 
     def __getstate__(self) -> Plain:
-        """All but what the class itself tells."""
+        """The state without that table."""
         return {name: value for name, value in self.__dict__.items() if name != "class_attributes"}
 
     def __setstate__(self, state: Plain) -> None:
@@ -149,7 +150,7 @@ class CopyableVecEnvWrapper(VecEnvWrapper):
 
 
 class LimitingVecEnv(CopyableVecEnvWrapper):
-    """The same for environments that cannot be reached, such as those of other processes.
+    """As :class:`EpisodeLimit`, for environments that cannot be wrapped one by one, e.g. those in other processes.
 
     Whatever is wrapped around this vector sees the end of the episode; a ``Monitor`` in another process does not.
     """
@@ -206,7 +207,7 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
 
 
 class MonitorOfLimit(Monitor):
-    """What a ``Monitor`` in another process is for a moment, so that the limit can be put beneath it."""
+    """The class that a ``Monitor`` in another process has for a moment, so that it puts the limit beneath itself."""
 
     def put_limit(self, index: int) -> None:
         """Put the limit around the task itself.
@@ -218,7 +219,7 @@ class MonitorOfLimit(Monitor):
 
 
 def with_episode_limit(venv: VecEnv) -> VecEnv:
-    """See that the environments of a vector can end an episode for the agent, and return the vector to use.
+    """Make the environments of a vector able to end an episode for the agent, and return the vector to use.
 
     The limit goes around each task itself where it can be reached: in this process, and beneath a ``Monitor`` that is
     outermost in another one. Elsewhere it goes around the innermost vector.

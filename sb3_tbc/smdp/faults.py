@@ -1,4 +1,4 @@
-"""Environments that raise, die or hang: which one it was, at which step, told in one line."""
+"""Errors for environments that raise, die or hang: one line that names the environment and the step."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PASSED_ON = (EnvironmentFault, NonFiniteError, ConfigError, HierarchyError)
 
 
 def fault(index: int, step: int, error: Exception) -> Exception:
-    """The error to raise for one that an environment raised: it names the environment and the step of its episode."""
+    """The error to raise when an environment raised ``error``: it names the environment and the step of its episode."""
     if isinstance(error, PASSED_ON):
         return error
     doing = f"at step {step} of its episode" if step else "at its reset"

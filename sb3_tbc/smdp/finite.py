@@ -1,4 +1,4 @@
-"""Whether what environments give is finite, and what to say if it is not."""
+"""Checks that observations and rewards are finite, and the error if they are not."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def all_finite(*arrays: FloatArray) -> bool:
 
 
 def bad_rows(seen: GoalObservation, rewards: FloatArray | None = None) -> BoolArray:
-    """Which environments gave something that is not finite, ``(n_envs,)``.
+    """Which environments gave an observation or reward that is not finite, ``(n_envs,)``.
 
-    :param seen: what they show, one row each
-    :param rewards: what they paid, ``(n_envs,)``
+    :param seen: their observations, one row each
+    :param rewards: their rewards, ``(n_envs,)``
     """
     bad = np.logical_or.reduce([~np.isfinite(seen[key]).all(axis=1) for key in GOAL_KEYS])
     return np.asarray(bad if rewards is None else bad | ~np.isfinite(rewards))
@@ -42,7 +42,7 @@ def describe(index: int, step: int, seen: GoalObservation, rewards: FloatArray |
 
 
 def refusal(seen: GoalObservation, steps: IntArray, rewards: FloatArray | None = None) -> NonFiniteError:
-    """The error for what would spoil all that learns from it: names environment, step and key.
+    """The error for values that are not finite, which would spoil learning; it names environment, step and key.
 
     :param steps: of the episodes, ``(n_envs,)``
     """

@@ -74,7 +74,7 @@ class UnitActions:
         self.centre, self.half = 0.5 * (space.low + space.high), 0.5 * (space.high - space.low)
 
     def unscale(self, unit: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-        """The environment's actions for unit ones, of the action space's type; exports round likewise."""
+        """The environment's actions for unit ones, of the action space's type; exported code rounds the same way."""
         actions = self.low + 0.5 * (unit + 1.0) * self.width
         return np.asarray(actions, dtype=self.dtype)
 

@@ -1,4 +1,4 @@
-"""A task's own reward and end, asked of achieved and desired goals, as learning in hindsight asks for them."""
+"""A task's own reward and termination as functions of achieved and desired goals, as hindsight needs them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
 from sb3_tbc.smdp.hindsight import GoalTest
 
 TRIED = 3
-"""Goals for which a task's functions are tried at once before learning begins."""
+"""Size of the batch of goals on which a task's functions are tried before learning begins."""
 
 
 def goal_test_of(venv: VecEnv) -> GoalTest:
@@ -96,7 +96,7 @@ class EpisodeJudge:
         self._warned = False
 
     def __getstate__(self) -> Plain:
-        """For copies, which ask their own environments."""
+        """The state without the goal test: a copy asks its own environments."""
         return {name: value for name, value in self.__dict__.items() if name != "goal_test"}
 
     @cached_property
@@ -105,7 +105,7 @@ class EpisodeJudge:
         return goal_test_of(self._venv)
 
     def succeeded(self, info: PlainMapping) -> bool:
-        """What the task says of an episode's last step, else what its functions say of the last goals.
+        """Whether an episode succeeded: as the task says in ``info``, else as its functions judge the last goals.
 
         :param info: of the step that ended the episode
         """

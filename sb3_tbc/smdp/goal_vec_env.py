@@ -18,11 +18,11 @@ from sb3_tbc.smdp.spaces import GoalObservation
 
 
 class RunningEpisode(NamedTuple):
-    """What it takes to live through an unfinished episode again."""
+    """What is needed to replay an unfinished episode."""
 
-    seed: int | None  # that the reset was given, or
-    generator: Plain  # the state of the task's random generator before the reset
-    actions: list[AnyArray]  # taken since
+    seed: int | None  # given to the reset; if None, the generator's state is used
+    generator: Plain  # state of the task's random generator before the reset
+    actions: list[AnyArray]  # taken since the reset
 
 
 def in_goal_vec_env(env: Env | VecEnv) -> Env | VecEnv:
@@ -38,8 +38,8 @@ class GoalVecEnv(DummyVecEnv):
     On tasks that step in microseconds those copies take longer than the task. Observations and infos are still the
     caller's own: arrays are copied, and so is the dictionary of an info, though not what lies in it.
 
-    The running episodes can be taken out and lived through again in environments made later, which leaves these in the
-    same state if all their randomness comes from ``np_random``, as Gymnasium asks for.
+    Running episodes are recorded, and can be replayed in environments made later. These then reach the same state if
+    all their randomness comes from ``np_random``, as Gymnasium requires.
     """
 
     def __init__(self, env_fns: list[Callable[[], Env]]) -> None:
@@ -64,7 +64,7 @@ class GoalVecEnv(DummyVecEnv):
         self.running[index] = RunningEpisode(seed, dict(generator.state) if seed is None else {}, [])
 
     def relive(self, running: Sequence[RunningEpisode]) -> GoalObservation:
-        """Begin the same episodes again and take the same actions; the observations they lead to."""
+        """Begin the same episodes again, take the same actions, and return the observations they lead to."""
         for index, (env, episode) in enumerate(zip(self.envs, running, strict=True)):
             if episode.seed is None:
                 env.unwrapped.np_random.bit_generator.state = episode.generator

@@ -73,7 +73,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
 
     :param venv: goal environments; automatic resets as in SB3
     :param high_level: proposes options; may be set later through the attribute of the same name
-    :param layout: what each level sees
+    :param views: what each level sees
     :param rules: what ends an option
     :param state_dim: width of the low level's memory to record with each step
     :param schedule: gives the time budgets where the high level does not
@@ -85,7 +85,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self,
         venv: VecEnv,
         high_level: HighLevel | None,
-        layout: LevelViews,
+        views: LevelViews,
         rules: OptionRules,
         state_dim: int = 0,
         schedule: Schedule | None = None,
@@ -93,16 +93,16 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
     ) -> None:
         space = check_goal_space(venv.observation_space, venv.action_space)
         venv = with_episode_limit(venv)
-        super().__init__(venv, observation_space=layout.low_space(), action_space=venv.action_space)
-        self.high_level, self.views, self.rules, self.schedule = high_level, layout, rules, schedule
-        self.clock = OptionClock(venv.num_envs, layout.subgoals, rules)
+        super().__init__(venv, observation_space=views.low_space(), action_space=venv.action_space)
+        self.high_level, self.views, self.rules, self.schedule = high_level, views, rules, schedule
+        self.clock = OptionClock(venv.num_envs, views.subgoals, rules)
         self.unit: Any = UnitActions(self.action_space)  # type: ignore[arg-type]
         self.gives_up = gives_up
         self._everywhere = np.arange(venv.num_envs)
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
         self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
-        ends_early = rules.ends_when_reached or layout.subgoals.event is not None
-        self._task_can_tell = ends_early and can_tell(venv, layout.subgoals)
+        ends_early = rules.ends_when_reached or views.subgoals.event is not None
+        self._task_can_tell = ends_early and can_tell(venv, views.subgoals)
         self.judge = EpisodeJudge(venv)
         self._started = False
         self._given: AnyArray = np.zeros(0)  # what step_async was given
@@ -139,7 +139,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         return {**recorded, **{f"clock.{name}": getattr(self.clock, name).copy() for name in self.clock.fields}}
 
     def set_state(self, state: Mapping[str, AnyArray], observation: GoalObservation) -> FloatArray:
-        """Take over what :meth:`get_state` gave, and go on from there.
+        """Restore what :meth:`get_state` gave.
 
         :param observation: what the environments show now
         :return: what the low level sees
@@ -210,7 +210,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         return HierarchicalStep(low, over, actions, observation, task_rewards, dones, infos, rewards, episodes)  # type: ignore[arg-type]
 
     def _refuse_bad(self, seen: GoalObservation, rewards: FloatArray | None = None) -> None:
-        """Let nothing in that is not finite.
+        """Refuse observations and rewards that are not finite.
 
         :raises NonFiniteError: naming environment, step and key
         """
@@ -220,10 +220,10 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
             raise refusal(seen, steps, rewards)
 
     def _windows_over(self, seen: GoalObservation, dones: BoolArray) -> BoolArray:
-        """Whose window ends with this step.
+        """Which windows end with this step, ``(n_envs,)``.
 
-        The last window of an episode ends when the task says that the episode does. It was told when that is to be;
-        where wrappers change what it sees, it may be a step late, which the window then lasts longer.
+        The last window of an episode was announced to the task, which ends the episode with it. Where wrappers change
+        what the task sees, this may be a step late; the window then lasts that step longer.
         """
         if self.gives_up is not None:
             self.clock.give_up(self.gives_up(seen, self.clock))
@@ -296,7 +296,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
             self.venv.env_method(ANNOUNCE, self._last_window(index), indices=[int(index)])
 
     def _last_window(self, index: int) -> LastWindow:
-        """What the live option of an environment is, for the task to end the episode with it."""
+        """The live option of an environment, described so that the task can end the episode with it."""
         elapsed = self.clock.elapsed[index]
         steps = max(1, math.ceil(self.clock.time_budget[index] - elapsed))
         if not self._task_can_tell:
@@ -315,7 +315,7 @@ CUT_OFF = tuple(
 
 
 def _tell_low_level(where: Indices, last: FloatArray, infos: list[Plain]) -> None:
-    """Say in ``infos`` how windows ended, as SB3's algorithms expect to be told of episodes."""
+    """Record in ``infos`` how windows ended, in the form in which SB3's algorithms expect the ends of episodes."""
     for index in where:
         cut = infos[index]["option"]["reason"] in CUT_OFF
         infos[index] |= {"terminal_observation": last[index], "TimeLimit.truncated": cut}

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import BoolArray, FloatArray
 from sb3_tbc.smdp.options import Episode, OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
@@ -23,7 +23,7 @@ GOAL_STRATEGIES = ("future", "episode", "event")
 
 
 def check_goal_strategy(strategy: str, subgoals: SubgoalSpace | None) -> None:
-    """See that hindsight goals can be chosen this way.
+    """Check that hindsight goals can be chosen this way.
 
     :param subgoals: the task's
     :raises ValueError: if the strategy is unknown, or the task has no such event
@@ -131,7 +131,7 @@ class HindsightSettings(NamedTuple):
     testing_penalty: float  # reward of a testing transition, negative
     keep_original: bool  # also store failed options as they were chosen (paper, algorithm 1 line 26)
     tolerance: float | None = None  # relabelled options further than this from where they ended are not a success
-    goals_met: str = "passing"  # when a window meets its hindsight goal: "passing" it, or at its "end" alone
+    goals_met: str = "passing"  # what counts as meeting a hindsight goal: "passing" it, or being there at the "end"
 
 
 def relabel_actions(
@@ -146,9 +146,9 @@ def relabel_actions(
     An achieved option keeps its action; another becomes (point reached, time it took), with the time drawn so that
     the budget would have expired at just that step.
 
-    :param tolerance: the success test of hindsight (paper section 4.5): where the point that was reached, in unit
-        coordinates, lies further than this from the nearest subgoal there is (outside of the bounds), the hindsight
-        option would not have been a success either, and the option keeps its action; None takes the nearest subgoal
+    :param tolerance: the success test of hindsight (paper section 4.5). A point outside of the subgoals' bounds is
+        replaced by the nearest subgoal. If it lies further from that than ``tolerance`` (unit coordinates), the
+        hindsight option would have failed as well, so the option keeps its action. None: every point is replaced
     """
     actions = np.stack([option.unit_action for option in episode.options])
     failed = np.array([not option.reached for option in episode.options])
@@ -223,64 +223,116 @@ def high_level_steps(
 
     :param high_view: maps goal observations to the high level's flat observation
     """
-    n = len(episode.options)
-    starts = np.array([option.start for option in episode.options])
-    durations = np.array([option.duration for option in episode.options])
-    ends = starts + durations
-    chosen = np.stack([option.unit_action for option in episode.options])
-    reached = np.array([option.reached for option in episode.options])
     actions, changed = relabel_actions(episode, subgoals, rules, rng, settings.tolerance)
-    testing = np.array([option.testing for option in episode.options])
-    before, after = _rows(episode, starts), _rows(episode, ends)
-    local, here = subgoals.local(before), subgoals.achieved(before)
-    rewards = reward.window_rewards(episode.rewards, starts, durations)
-    bonus = reward.completion_bonus * (reached | changed)
-    dones = np.zeros(n, dtype=bool)
-    dones[-1] = episode.terminated
+    options = _Options(episode, subgoals, actions, changed)
+    source = _TransitionSource(options, rules, reward, high_view, episode)
+    parts = [source.failed_tests(settings.testing_penalty)]
+    if settings.keep_original:
+        parts.append(source.as_chosen())
+    parts.append(source.as_relabelled())
+    pairs = goal_pairs(len(options.starts), settings.n_goals, settings.goal_strategy, rng, options.event)
+    if len(pairs):
+        at_end = reward.target == "decision" or settings.goals_met == "end"
+        parts.append(source.with_hindsight_goals(pairs, goal_test, at_end))
+    return HighLevelSteps(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
-    def steps(
+
+class _Options:
+    """The options of an episode as arrays, one row each.
+
+    :param actions: their hindsight actions, ``(n, subgoal_dim + 1)``
+    :param changed: which of these differ from the chosen actions, ``(n,)``
+    """
+
+    def __init__(self, episode: Episode, subgoals: SubgoalSpace, actions: FloatArray, changed: BoolArray) -> None:
+        options = episode.options
+        self.starts = np.array([option.start for option in options])
+        self.durations = np.array([option.duration for option in options])
+        self.ends = self.starts + self.durations
+        self.chosen = np.stack([option.unit_action for option in options])
+        self.reached = np.array([option.reached for option in options])
+        self.testing = np.array([option.testing for option in options])
+        self.actions, self.changed = actions, changed
+        self.before, self.after = _rows(episode, self.starts), _rows(episode, self.ends)
+        self.local, self.here = subgoals.local(self.before), subgoals.achieved(self.before)
+        self.dones = np.zeros(len(options), dtype=bool)
+        self.dones[-1] = episode.terminated
+        happened = np.flatnonzero(subgoals.happened(self.after))
+        self.event = int(happened[0]) if len(happened) else None  # the option that the task's event ended
+
+
+class _TransitionSource:
+    """Makes the high level's transitions of an episode from its options.
+
+    :param high_view: maps goal observations to the high level's flat observation
+    """
+
+    def __init__(
+        self,
+        options: _Options,
+        rules: OptionRules,
+        reward: HighLevelReward,
+        high_view: Callable[[dict[str, FloatArray]], FloatArray],
+        episode: Episode,
+    ) -> None:
+        self.options, self.rules, self.reward, self.high_view, self.episode = options, rules, reward, high_view, episode
+        self.rewards = reward.window_rewards(episode.rewards, options.starts, options.durations)
+        self.bonus = reward.completion_bonus * (options.reached | options.changed)
+
+    def failed_tests(self, penalty: float) -> HighLevelSteps:
+        """Failed tests of subgoals, under the actions that were chosen, with the penalty as reward."""
+        o = self.options
+        rows = np.flatnonzero(o.testing & ~o.reached)
+        return self._steps(rows, o.chosen[rows], np.full(len(rows), penalty), o.dones[rows], o.durations[rows], False)
+
+    def as_chosen(self) -> HighLevelSteps:
+        """Options that hindsight changes, as they were chosen; failed tests have their penalty instead."""
+        o = self.options
+        rows = np.flatnonzero(o.changed & ~o.testing)
+        charged = self._charged(self.rewards[rows], o.chosen[rows])
+        return self._steps(rows, o.chosen[rows], charged, o.dones[rows], o.durations[rows], False)
+
+    def as_relabelled(self) -> HighLevelSteps:
+        """All options under their hindsight actions; a failed test that has none only has its penalty."""
+        o = self.options
+        rows = np.flatnonzero(o.reached | o.changed | ~o.testing)
+        gained = self._charged(self.rewards, o.actions) + self.bonus
+        return self._steps(rows, o.actions[rows], gained[rows], o.dones[rows], o.durations[rows], True)
+
+    def with_hindsight_goals(self, pairs: NDArray[np.int64], goal_test: GoalTest, at_end: bool) -> HighLevelSteps:
+        """Options under their hindsight actions and hindsight goals.
+
+        :param pairs: from :func:`goal_pairs`
+        :param at_end: see :func:`relabel_goals`
+        """
+        o, rows = self.options, pairs[:, 0]
+        goals = self.episode.achieved_goal[o.ends[pairs[:, 1]]]
+        copies = relabel_goals(self.episode, o.starts[rows], o.durations[rows], goals, self.reward, goal_test, at_end)
+        gained = self._charged(copies.rewards, o.actions[rows]) + self.bonus[rows]
+        return self._steps(rows, o.actions[rows], gained, copies.dones, copies.durations, True, goals)
+
+    def _charged(self, rewards: FloatArray, actions: FloatArray) -> FloatArray:
+        """Rewards less the price of the time budgets in ``actions``."""
+        return rewards - self.reward.duration_cost * self.rules.budget(actions[:, -1]) / self.rules.dt_max
+
+    def _steps(
+        self,
         rows: NDArray[np.int64],
         actions: FloatArray,
         rewards: FloatArray,
-        dones: NDArray[np.bool_],
+        dones: BoolArray,
         durations: NDArray[np.int64],
         relabelled: bool,
         goals: FloatArray | None = None,
     ) -> HighLevelSteps:
-        old, new = ({k: v[rows] for k, v in part.items()} for part in (before, after))
+        o = self.options
+        old, new = ({key: values[rows] for key, values in part.items()} for part in (o.before, o.after))
         if goals is not None:
             old["desired_goal"] = new["desired_goal"] = goals
         return HighLevelSteps(
-            high_view(old), actions, rewards, high_view(new), dones, reward.discounts(durations),
-            changed[rows] & relabelled, durations, local[rows], here[rows],
+            self.high_view(old), actions, rewards, self.high_view(new), dones, self.reward.discounts(durations),
+            o.changed[rows] & relabelled, durations, o.local[rows], o.here[rows],
         )  # fmt: skip
-
-    def charged(rewards: FloatArray, actions: FloatArray) -> FloatArray:
-        return rewards - reward.duration_cost * rules.budget(actions[:, -1]) / rules.dt_max
-
-    parts = []
-    tests = np.flatnonzero(testing & ~reached)
-    penalty = np.full(len(tests), settings.testing_penalty)
-    parts.append(steps(tests, chosen[tests], penalty, dones[tests], durations[tests], False))
-    if settings.keep_original:
-        kept = np.flatnonzero(changed & ~testing)
-        parts.append(
-            steps(kept, chosen[kept], charged(rewards[kept], chosen[kept]), dones[kept], durations[kept], False)
-        )
-    every = np.flatnonzero(reached | changed | ~testing)  # a failed test without a hindsight action has its penalty
-    gained = charged(rewards, actions) + bonus
-    parts.append(steps(every, actions[every], gained[every], dones[every], durations[every], True))
-    happened = np.flatnonzero(subgoals.happened(after))
-    event = int(happened[0]) if len(happened) else None
-    pairs = goal_pairs(n, settings.n_goals, settings.goal_strategy, rng, event)
-    if len(pairs):
-        goals = episode.achieved_goal[ends[pairs[:, 1]]]
-        at_end = reward.target == "decision" or settings.goals_met == "end"
-        copies = relabel_goals(episode, starts[pairs[:, 0]], durations[pairs[:, 0]], goals, reward, goal_test, at_end)
-        rows = pairs[:, 0]
-        again = charged(copies.rewards, actions[rows]) + bonus[rows]
-        parts.append(steps(rows, actions[rows], again, copies.dones, copies.durations, True, goals))
-    return HighLevelSteps(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
 class RelabelledGoals(NamedTuple):

@@ -81,9 +81,9 @@ class OptionRules:
         return self.window_end == "reconsider"
 
     def completed(self, expired: BoolArray, reached: BoolArray | None, may_end: BoolArray | bool = True) -> BoolArray:
-        """Which windows have run to an end of their own, which nothing from outside cut off.
+        """Which windows ended by their own rule, i.e. were not cut off from outside.
 
-        This is the one rule of a window's end: the agent acts by it, both levels learn by it.
+        This is the one place for the rule: acting and both levels' learning use it.
 
         :param expired: whose time budget is spent
         :param reached: whose subgoal is reached; may be None where that ends no window
@@ -97,7 +97,7 @@ class OptionRules:
         return np.maximum(np.rint(steps), 1.0) if self.whole_budgets else np.asarray(steps)
 
     def budget_that_lasted(self, steps: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """Time budgets that expire after just so many steps, drawn uniformly before they are rounded, ``(n,)``."""
+        """Time budgets that expire after exactly ``steps`` steps, drawn uniformly before rounding, ``(n,)``."""
         return np.asarray(steps + (0.5 if self.whole_budgets else 0.0) - rng.random(len(steps)))
 
     def unit_budget(self, steps: FloatArray) -> FloatArray:
@@ -168,9 +168,9 @@ class OptionClock:
     """
 
     carried = ("subgoal", "time_budget", "elapsed", "used")
-    """What acting needs of it, one row per environment."""
+    """The fields that acting needs, one row per environment."""
     fields = ("unit_action", *carried, "testing")
-    """All that it holds."""
+    """All fields."""
 
     def __init__(self, n_envs: int, subgoals: SubgoalSpace, rules: OptionRules) -> None:
         self.subgoals, self.rules = subgoals, rules
@@ -238,13 +238,13 @@ class OptionClock:
         return over if self.subgoals.event is None else over | self.subgoals.happened(seen)
 
     def reached(self, seen: GoalObservation, where: Indices | slice = slice(None)) -> BoolArray:
-        """Whose subgoal is reached, of the environments ``where`` that ``seen`` has rows of."""
+        """Whose subgoal is reached, among the environments ``where``; ``seen`` has one row for each of them."""
         return self.subgoals.reached(self.subgoals.achieved(seen), self.subgoal[where])
 
     def close(self, index: int, step: int, reached: bool, episode_over: bool) -> Option:
         """The option of environment ``index`` as a record.
 
-        An option that was cut off did not get to show whether it reaches its subgoal: it counts as not reached.
+        An option that was cut off had no chance to reach its subgoal: it counts as not reached.
 
         :param step: the number of steps of its episode so far
         :param reached: whether its subgoal is reached now

@@ -44,7 +44,7 @@ class EpisodeRecorder:
         self._write((indices, self.steps[indices]), observation)
 
     def before_step(self, actions: FloatArray, states: FloatArray, next_states: FloatArray) -> None:
-        """What the low level is about to do in every environment, and its memory before and after."""
+        """Record what the low level is about to do in every environment, and its memory before and after."""
         at = self._now()
         if int(self.steps.max()) + 1 >= self._rewards.shape[1]:
             self._grow()
@@ -54,7 +54,7 @@ class EpisodeRecorder:
             self._data["next_states"][at] = next_states
 
     def after_step(self, rewards: FloatArray, observation: GoalObservation) -> None:
-        """What the step led to in every environment, before any automatic reset."""
+        """Record what the step led to in every environment, before any automatic reset."""
         self._rewards[self._now()] = rewards
         self.steps += 1
         self._write(self._now(), observation)
@@ -87,7 +87,7 @@ class EpisodeRecorder:
         return {**held, "steps": self.steps.copy(), "rewards": self._rewards[:, :rows].copy(), "options": packed}
 
     def set_state(self, state: Mapping[str, AnyArray]) -> None:
-        """Take over what :meth:`get_state` gave."""
+        """Restore what :meth:`get_state` gave."""
         self.steps[:] = state["steps"]
         rows = state["rewards"].shape[1]
         while self._rewards.shape[1] < rows:

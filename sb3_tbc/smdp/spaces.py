@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +14,9 @@ from sb3_tbc.arrays import FloatArray as FloatArray
 
 GoalObservation = Mapping[str, AnyArray]
 """A goal environment's observation: ``observation``, ``achieved_goal``, ``desired_goal``, single or batched."""
+
+Part = str | Sequence[str | int | None]
+"""Entries of a goal observation: the name of a part, or ``(name, start, stop)``."""
 
 
 class Slice(NamedTuple):
@@ -39,7 +42,7 @@ class Slices:
         return found[0] if len(found) == 1 else np.concatenate(found, axis=-1)
 
     @classmethod
-    def of(cls, given: Iterable[str | Sequence[Any]]) -> Slices:
+    def from_parts(cls, given: Iterable[Part]) -> Slices:
         """From names of parts and ``(name, start, stop)``.
 
         :raises ValueError: if a part has another form
@@ -47,12 +50,11 @@ class Slices:
         return cls(tuple(_slice(part) for part in given))
 
 
-def _slice(given: str | Sequence[Any]) -> Slice:
-    parts: tuple[Any, ...] = (given,) if isinstance(given, str) else tuple(given)
-    numbers = [number for number in parts[1:] if number is not None]
-    if not 1 <= len(parts) <= 3 or not isinstance(parts[0], str) or not all(type(n) is int for n in numbers):
+def _slice(given: Part) -> Slice:
+    key, *numbers = (given,) if isinstance(given, str) else given if len(given) else (None,)
+    if len(numbers) > 2 or not isinstance(key, str) or not all(n is None or type(n) is int for n in numbers):
         raise ValueError(f"a slice is the name of an observation's part, or (name, start, stop), got {given!r}")
-    return Slice(*parts)
+    return Slice(key, *numbers)  # type: ignore[arg-type]
 
 
 class SubgoalSpace:
@@ -77,7 +79,7 @@ class SubgoalSpace:
     :raises ValueError: if bounds, thresholds and groups do not fit together, or the event is no index
     """
 
-    event: int | None = None  # also of spaces in agents that were saved before there were events
+    event: int | None = None  # on the class: agents saved before this attribute existed have it, too
     rotations: tuple[int, ...] = ()  # likewise
 
     def __init__(
@@ -132,8 +134,8 @@ class SubgoalSpace:
         low: ArrayLike,
         high: ArrayLike,
         thresholds: ArrayLike,
-        achieved: Iterable[str | Sequence[Any]] = ("achieved_goal",),
-        local: Iterable[str | Sequence[Any]] = ("observation",),
+        achieved: Iterable[Part] = ("achieved_goal",),
+        local: Iterable[Part] = ("observation",),
         *,
         local_scale: ArrayLike,
         names: Sequence[str],
@@ -142,7 +144,7 @@ class SubgoalSpace:
     ) -> SubgoalSpace:
         """A subgoal space whose maps only pick entries of the observation, and are therefore plain data.
 
-        It travels to other processes and into files without code. An example::
+        Such a space can be sent to other processes and saved in files without any code. An example::
 
             SubgoalSpace.from_slices(
                 [-1, -1], [1, 1], [0.1, 0.1], achieved=[("observation", 0, 2)], local=["observation"],
@@ -153,12 +155,11 @@ class SubgoalSpace:
             ``(name, start, stop)``, laid end to end
         :param local: likewise what the low level sees
 
-        Other parameters are the class's own.
-        :raises ValueError: if a slice has another form, or see the class
+        Other parameters are those of the class.
+        :raises ValueError: if a slice has another form; also as the class does
         """
-        return cls(
-            low, high, thresholds, Slices.of(achieved), Slices.of(local), local_scale, names, groups=groups, event=event
-        )
+        maps = Slices.from_parts(achieved), Slices.from_parts(local)
+        return cls(low, high, thresholds, *maps, local_scale, names, groups=groups, event=event)
 
     @property
     def is_data(self) -> bool:

@@ -252,7 +252,7 @@ def make_low_buffer(
         own.buffer_size,
         ends.observation,
         ends.action,
-        layout=views,
+        views=views,
         rules=reward.rules,
         state_dim=low.state_dim,
         gamma=own.gamma,

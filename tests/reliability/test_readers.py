@@ -29,7 +29,7 @@ BOMB = "a0: &a0 [x,x,x,x,x,x,x,x,x,x]\n" + "\n".join(
     ("text", "message"),
     [
         (BOMB, "more than 100000 values once its aliases are written out"),
-        ("a: &a [*a]", "an alias refers to what it lies in"),
+        ("a: &a [*a]", "an alias refers to a node that contains it"),
         ("[" * 1000, "nested too deeply|no YAML"),
         ("a: !!python/object/apply:os.system [ls]", "no YAML"),
         ("2020-99-99", "no YAML"),

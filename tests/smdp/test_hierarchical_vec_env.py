@@ -172,9 +172,9 @@ def test_environment_without_goals_is_refused() -> None:
     import gymnasium as gym
 
     venv = DummyVecEnv([lambda: gym.make("MountainCarContinuous-v0")])
-    layout = LevelViews(Corridor().subgoals, True)
+    views = LevelViews(Corridor().subgoals, True)
     with pytest.raises(ValueError, match="goal environment"):
-        HierarchicalVecEnv(venv, None, layout, OptionRules(5.0))
+        HierarchicalVecEnv(venv, None, views, OptionRules(5.0))
 
 
 @pytest.mark.parametrize(
