@@ -1,4 +1,4 @@
-"""Arguments of one update by name; as leaves in the order of torch's pytree, they are what the update takes."""
+"""The arguments of one update by name; the update takes them as a flat list, in the order of torch's pytree."""
 
 from __future__ import annotations
 

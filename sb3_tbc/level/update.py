@@ -32,13 +32,13 @@ from sb3_tbc.replay.batch import LevelBatch
 from sb3_tbc.smdp.bounds import ValueBounds
 
 DIAGNOSTICS = ("critic_loss", "actor_loss", "ent_coef_loss", "ent_coef", "q_mean", "entropy", "target_clipped")
-"""Of which the mean is logged; ``target_clipped`` is the share of targets that were moved to a bound."""
+"""Quantities whose mean is logged; ``target_clipped`` is the share of targets that were moved to a bound."""
 EXTREMES: dict[str, Callable[[float, float], float]] = {"target_min": min, "target_max": max}
-"""Of which the lowest and the highest are logged: the critics' targets."""
+"""The lowest and the highest target of the critics, which are logged as well."""
 ACTOR_Q = {"min": 0.0, "max": 1.0, "mean": None}
-"""Names of :class:`SACUpdate`'s ``actor_q``; the mean is a mean of all critics, also where there are more than two."""
+"""Values of ``actor_q`` that have a name; the mean is over all critics, even if there are more than two."""
 AVERAGE_DECAY = 0.999
-"""Decay per update of the averaged actor unless given; during the first updates (1 + n) / (10 + n) if smaller."""
+"""Default decay per update of the averaged actor; in the n-th update at most (1 + n) / (10 + n)."""
 SQUASH_EPSILON = 1e-6
 """Added inside the logarithm of tanh's derivative, as SB3 does."""
 HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
@@ -278,7 +278,7 @@ class SACUpdate:
         self._step_for(batch_size, ent_coef)
 
     def rehearse(self, batch_size: int, ent_coef: th.Tensor) -> None:
-        """One update on copies, eagerly, for those who want to watch its operations."""
+        """Run one update eagerly on copies, so that its operations can be observed, e.g. by a profiler."""
         self._step(*(tensor.clone() for tensor in tree_leaves(self.example(batch_size, ent_coef))))
 
     def _step(self, *leaves: th.Tensor) -> None:
@@ -390,7 +390,7 @@ class SACUpdate:
         return th.minimum(target_q.clamp(min=bounds.low), highest)
 
     def _actor_loss(self, x: StepInputs, actions: th.Tensor, log_prob: th.Tensor, ent_coef: th.Tensor) -> th.Tensor:
-        """``alpha log pi - Q``, Q what ``actor_q`` says, and the labels' loss where there are any.
+        """``alpha log pi - Q`` with the Q that ``actor_q`` chooses, plus the labels' loss where there are labels.
 
         The latter is the paper's ``L_dt = E (dt - dt*)^2``, in unit coordinates of the action.
         """

@@ -10,7 +10,7 @@ from sb3_tbc.tbc_hrl.reconsideration import Reconsideration
 
 
 class TwoLevelActor:
-    """The high level proposes options, the low level acts on them and remembers for as long as it may.
+    """The high level proposes options; the low level acts on them and keeps its memory for as long as ``memory`` says.
 
     Acting deterministically is what an agent is evaluated and deployed with: by the means of both levels, and by their
     averaged actors where they are kept.

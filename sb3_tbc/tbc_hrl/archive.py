@@ -1,4 +1,4 @@
-"""What a saved agent's ``.zip`` may hold, looked at before anything of it is used."""
+"""Checks of a saved agent's ``.zip`` before anything in it is used."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ MAX_DATA = 64 * 2**20
 """Largest ``data`` or ``plain.json``, bytes; ours have some 10,000."""
 MAX_GROWTH = 20
 SMALL = 2**20
-"""A file may unpack to so many times its size, and this much more; SB3 does not compress at all."""
+"""Most bytes that a file may unpack to: ``MAX_GROWTH`` times its size plus ``SMALL``; SB3 does not compress at all."""
 NAME = re.compile(r"[A-Za-z_][\w.]*")
 
 
 class UntrustedError(ConfigError):
-    """Loading would run code that the file brings along, and nobody said that it is trusted."""
+    """Loading would run code from the file, and the caller did not say that the file is trusted."""
 
 
 def read_bytes(path: str | Path | io.BufferedIOBase) -> bytes:
-    """The whole file, also where ``.zip`` is left out as SB3 allows.
+    """The whole file; as in SB3, the ending ``.zip`` may be left out.
 
     :raises ConfigError: if it is missing or cannot be read
     """
@@ -48,11 +48,11 @@ def read_bytes(path: str | Path | io.BufferedIOBase) -> bytes:
 
 
 def read_data(content: bytes, name: str) -> Plain:
-    """The tables ``data`` and, under its name, ``plain.json`` of an agent, after a look at the whole file.
+    """Check the whole file of an agent; return its table ``data``, which gets the table ``plain.json`` as an entry.
 
     :param content: of the file
     :param name: of the file, for messages
-    :raises ConfigError: if it is damaged, no agent, or holds what no agent holds
+    :raises ConfigError: if it is damaged, is not an agent, or holds what no agent holds
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -120,11 +120,11 @@ def unpickled(data: Plain, name: str, given: Plain, has_env: bool) -> Plain:
     :param given: values that the caller has for some entries
     :param has_env: whether the caller brings an environment, whose own subgoal space then takes the place of one
         without a plain form
-    :raises UntrustedError: if an entry has no plain value that makes sense, or the file brings an environment along
+    :raises UntrustedError: if an entry has no plain value that makes sense, or the file contains an environment
     """
     plain = data.get(PLAIN_DATA, {})
     if "env" in data:
-        raise UntrustedError(f"{name} brings an environment along; {CURE}")
+        raise UntrustedError(f"{name} contains an environment, which can run any code; {CURE}")
     values: Plain = {}
     for key in pickled_keys(data):
         if key in given:

@@ -33,11 +33,11 @@ class SB3Arguments(Settings):
     """What Stable-Baselines3 asks of an algorithm besides its settings."""
 
     stats_window_size: Annotated[int, Range(1)] = 100
-    """Episodes that logged means run over."""
+    """Number of latest episodes that logged means are taken over."""
     tensorboard_log: str | os.PathLike[str] | None = None
-    """Folder for TensorBoard's files; none writes none."""
+    """Folder for TensorBoard's files; none: no files are written."""
     verbose: Annotated[int, Range(0, 2)] = 0
-    """How much is printed: nothing, what happens, everything."""
+    """How much is printed: 0 nothing, 1 progress and notices, 2 everything."""
     device: str | th.device = "cpu"
     """Torch device: ``cpu``, ``cuda``, ``cuda:0``, ..., or ``auto``."""
     seed: Annotated[int, Range(0, 2**32 - 1)] | None = None
@@ -58,7 +58,7 @@ class SB3Arguments(Settings):
 
 
 def check_device(device: str | th.device) -> None:
-    """See that torch knows a device and has it.
+    """Check that torch knows a device and can use it.
 
     :raises SettingError: naming the devices there are
     """
@@ -76,10 +76,10 @@ def check_device(device: str | th.device) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class HierarchyArguments(SB3Arguments):
-    """What an agent of two levels is told besides."""
+    """Further arguments of an agent of two levels."""
 
     subgoals: SubgoalSpace | None = None
-    """Subgoal space, for environments that do not bring one."""
+    """Subgoal space, for environments without an attribute ``subgoals``."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class SignatureOfSettings:
 
 
 def _parameter(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
-    """A field as a keyword argument; a section may be given as a mapping, and its default is "as it is"."""
+    """A field as a keyword argument; a section may be given as a mapping, and None leaves it at its defaults."""
     default = default_of(field)
     if isinstance(default, Settings):
         kind, default = kind | PlainMapping | None, None

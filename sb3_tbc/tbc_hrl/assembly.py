@@ -116,7 +116,7 @@ def make_schedule(
 def make_high_bounds(
     config: TBCConfig, reward: HighLevelReward, rules: OptionRules, rewards: RewardRange | None
 ) -> ValueBounds | None:
-    """What the high level's targets are clipped to; None: to nothing.
+    """What the high level's targets are clipped to; None: they are not clipped.
 
     :param rewards: of an environment step; None where they are not known, which leaves targets free
     """
@@ -134,7 +134,7 @@ def make_high_bounds(
 
 
 def make_low_bounds(config: TBCConfig, reward: LowLevelReward) -> ValueBounds | None:
-    """What the low level's targets are clipped to; None: to nothing."""
+    """What the low level's targets are clipped to; None: they are not clipped."""
     if config.low.target_bounds != "auto":
         return _given_bounds(config.low)
     return low_level_bounds(reward, config.low.gamma)

@@ -1,4 +1,4 @@
-"""What users call with: refused in one line where it cannot be meant."""
+"""Checks of what users pass to an agent's methods: a mistake is refused in one line."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def whole_steps(total_timesteps: Any) -> int:
 
 
 def refuse_vec_normalize(env: VecEnv) -> None:
-    """Say why observations must not be normalised on the way.
+    """Refuse environments that normalise observations.
 
-    :raises ValueError: if they are
+    :raises ValueError: if this one does, with the reason
     """
     if unwrap_vec_normalize(env) is not None:
         raise ValueError(

@@ -46,9 +46,9 @@ __all__ = [
 
 
 WINDOW_STEPS = 10
-"""Steps that ``max_options: auto`` leaves to each decision: time for the low level to do something."""
+"""Steps of an episode for each decision with ``max_options: auto``: time for the low level to do something."""
 MOST_OPTIONS = 20
-"""And the most decisions that it allows, however long an episode is."""
+"""Most decisions with ``max_options: auto``, however long an episode is."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,10 +56,11 @@ class AgentConfig(Settings):
     """Settings of an agent of two levels that are not of one level alone."""
 
     max_options: Annotated[int, Range(1, 1_000_000)] | Literal["auto"] = 20
-    """High-level decisions allowed per episode; ``auto``: as many as leave ten steps to each, at most 20."""
+    """High-level decisions allowed per episode; ``auto``: one for every ten steps of an episode, at most 20."""
     window_end: Literal["timed", "reached", "reconsider"] = "timed"
-    """What ends a window: its time budget alone (HiTS); reaching the subgoal as well (algorithm 1); or the high level
-    as well, when its critic values a new option more than the rest of this one (arXiv 2211.06351)."""
+    """What ends a window. ``timed``: its time budget alone (HiTS). ``reached``: reaching the subgoal as well (algorithm
+    1). ``reconsider``: also the high level, when its critic values a new option more than the rest of this one (arXiv
+    2211.06351)."""
     reconsider_margin: Price = 1.0
     """How much more a new option must be worth to end a window with ``window_end: reconsider``, in the high level's
     rewards; 1 is the price of a decision."""
@@ -71,20 +72,20 @@ class AgentConfig(Settings):
     """Round time budgets to the nearest whole number of steps, as the paper does (section 4.1); else a fractional
     budget lasts until the first step that is not shorter."""
     duration: Literal["joint", "rule", "fixed"] = "joint"
-    """Who sets the time budget: the high level together with the subgoal, the rule of equation 1
-    (``clip(kappa * H_reach, dt_min, dt_max)``), or nobody: it is always ``fixed_duration``."""
+    """Who sets the time budget. ``joint``: the high level, together with the subgoal. ``rule``: the rule of equation 1,
+    ``clip(kappa * H_reach, dt_min, dt_max)``. ``fixed``: nobody, it is always ``fixed_duration``."""
     fixed_duration: Positive | None = None
     """Constant time budget for ``duration: fixed``, environment steps; none: ``dt_max``."""
     kappa: Positive = 1.0
-    """Scales the estimated steps to a subgoal into a time budget (equation 1, table A2)."""
+    """Factor from the estimated steps to a subgoal to its time budget (equation 1, table A2)."""
     duration_loss_coef: Price = 0.0
     """Weight of the loss that draws the high level's time budget toward the rule's (section 4.2), in unit action
     coordinates; 0 leaves it out."""
     remaining_time: bool = True
     """Whether the low level sees how much of its time budget is left."""
     target: Literal["smdp", "decision"] = "smdp"
-    """The high level learns rewards of the whole window and a discount per step (paper), or the last reward of
-    the window and a discount per decision (HiTS)."""
+    """What the high level learns from a window. ``smdp``: all its rewards, and a discount per step (paper).
+    ``decision``: its last reward, and a discount per decision (HiTS)."""
     decision_cost: Price = 1.0
     """Price of each decision of the high level; with ``target: smdp`` only, HiTS's reward has it built in."""
     duration_cost: Price = 2.0
@@ -92,8 +93,8 @@ class AgentConfig(Settings):
     completion_bonus: Price = 0.0
     """Added to the high level's reward where an option reaches its subgoal, in hindsight too (section 4.5)."""
     low_reward: Literal["sparse", "dense", "step"] = "sparse"
-    """The low level's reward: 1 where the window ends with its subgoal reached; the same plus how much nearer each step
-    came; or -1 for each step until the subgoal is reached (HAC)."""
+    """The low level's reward. ``sparse``: 1 where the window ends with its subgoal reached. ``dense``: the same, plus
+    how much nearer each step came to the subgoal. ``step``: -1 for each step until the subgoal is reached (HAC)."""
     testing_fraction: Fraction = 0.3
     """Share of options that test their subgoal: a failed test is punished."""
     deterministic_testing: bool = False
@@ -104,29 +105,30 @@ class AgentConfig(Settings):
     """Also learn from failed options as they were chosen, besides what hindsight makes of them (algorithm 1)."""
     relabel_tolerance: NotNegative | None = None
     """Largest distance, in unit coordinates, between where a failed option ended and the subgoal it is relabelled with
-    (the paper's success test: 0.05); none relabels them all."""
+    (the paper's success test: 0.05); none: all failed options are relabelled."""
     random_fraction: Fraction = 0.05
     """Share of uniformly random actions on each level while exploring."""
     n_hindsight_goals: Annotated[int, Range(0, 1_000_000)] = 3
-    """Hindsight goals for each transition."""
+    """Number of hindsight goals for each transition."""
     goal_strategy: Literal["future", "episode", "event"] = "future"
-    """Where the high level's hindsight goals come from: later options of the episode, any of its options, or the option
-    that the task's event ended."""
+    """Where the high level's hindsight goals come from. ``future``: later options of the episode. ``episode``: any of
+    its options. ``event``: the option that the task's event ended."""
     goals_met: Literal["passing", "end"] = "passing"
-    """When a window meets a hindsight goal: while passing it, as the episode would have ended there, or at its end
-    alone, as HiTS's target always does."""
+    """What counts as meeting a hindsight goal. ``passing``: the window passes it, since the episode would have ended
+    there. ``end``: the window ends at it, as with ``target: decision`` in any case."""
     gradient_ratio: UpdateRatio = 1.0
     """Updates of each level per environment step, done in bursts after episodes."""
     learning_starts: Annotated[int, Range(0)] = 0
     """Environment steps before the first update."""
     memory: Literal["window", "episode", "none"] = "none"
-    """How long the circuit remembers: until the window ends, until the episode ends, or from no step to the next."""
+    """When the circuit's memory is reset. ``window``: when a window ends. ``episode``: when the episode ends. ``none``:
+    at every step, so that nothing is remembered."""
     sequence_length: Annotated[int, Range(1, 1000)] = 1
-    """Steps through which the low level's update recomputes its memory; 1 takes the stored one."""
+    """Number of steps through which an update of the low level recomputes its memory; 1: the stored memory is used."""
     relative_subgoals: bool = False
     """Show the low level the distance to its subgoal instead of the subgoal itself."""
     compile: bool | Literal["auto"] = "auto"
-    """Compile the updates; ``auto``: where a C++ compiler is found and the run is long enough to gain."""
+    """Compile the updates; ``auto``: if a C++ compiler is found and the run is long enough to gain from it."""
 
     def for_episodes_of(self, steps: int | None) -> Self:
         """These settings with ``max_options`` as a number.
@@ -236,7 +238,7 @@ class FlatPolicyConfig(Settings):
     net_arch: tuple[Width, ...] | NetArch = (256, 256)
     """Neurons of each hidden layer, for actor and critics alike, or ``pi`` and ``qf`` where they differ."""
     n_critics: Annotated[int, Range(1, 100)] = 2
-    """Critics of which the lowest value counts."""
+    """Number of critics; the lowest of their values counts."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -262,9 +264,9 @@ class FlatConfig(Settings):
     gradient_ratio: UpdateRatio = 1.0
     """Updates per environment step, done every 100 steps."""
     n_hindsight_goals: Annotated[int, Range(0, 1_000_000)] = 3
-    """Relabelled samples for each plain one."""
+    """Number of relabelled samples for each plain one."""
     goal_strategy: Literal["future", "episode", "event"] = "future"
-    """Where hindsight goals come from: later steps of the episode, any of its steps, or the step of the task's
-    event."""
+    """Where hindsight goals come from. ``future``: later steps of the episode. ``episode``: any of its steps.
+    ``event``: the step of the task's event."""
     policy_kwargs: FlatPolicyConfig = FlatPolicyConfig()
     """Networks."""

@@ -36,7 +36,7 @@ def reward_range(env: VecEnv) -> RewardRange | None:
 def episode_length(env: VecEnv) -> int | None:
     """Time limit of the task under its wrappers, environment steps; None where it has none.
 
-    Environments in this process are looked at layer by layer, those in others by what their attributes say.
+    Environments in this process are examined wrapper by wrapper, those in other processes by their attributes.
     """
     inner = getattr(env.unwrapped, "envs", None)
     limit: int | None

@@ -100,7 +100,7 @@ class FlatSAC(PlainAlgorithm, SAC):
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": MultiInputPolicy}
     config_class: ClassVar[type[FlatConfig]] = FlatConfig
     stop_requested: bool
-    """Set it to make :meth:`learn` return as soon as all is at a point to go on from exactly."""
+    """Set it to make :meth:`learn` return at the next point from which learning can be continued exactly."""
     __signature__ = SignatureOfSettings(SB3Arguments)
 
     @takes(FlatArguments)
@@ -194,7 +194,7 @@ class FlatSAC(PlainAlgorithm, SAC):
         return self
 
     def _collect(self, steps: int, callback: BaseCallback, log_interval: int) -> bool:
-        """Step every environment so often; False if a callback asks to stop."""
+        """Step every environment ``steps`` times; False if a callback asks to stop."""
         assert self.env is not None
         rollout = self.collect_rollouts(
             self.env,
@@ -208,9 +208,9 @@ class FlatSAC(PlainAlgorithm, SAC):
         return bool(rollout.continue_training)
 
     def _update(self) -> None:
-        """Update as often as ``gradient_ratio`` and the steps since the last time say; what is left stays owed.
+        """Do the updates that ``gradient_ratio`` gives for the steps since the last call; a fraction is kept for later.
 
-        Without a finished episode there are no goals to take in hindsight: those updates wait.
+        Before the first episode has ended there are no hindsight goals: the updates wait for it.
         """
         steps = max(self.num_timesteps - max(self._updated_at, self.learning_starts), 0)
         self._updated_at = self.num_timesteps
@@ -266,7 +266,7 @@ class FlatSAC(PlainAlgorithm, SAC):
             self.close_running_episodes()
 
     def close_running_episodes(self) -> None:
-        """Let the episodes that run end where they are: what was stored of them is used, the rest never comes."""
+        """End the running episodes where they are: what was stored of them is used, and they are not continued."""
         buffer = self._her_buffer()
         if (buffer._current_ep_start != buffer.pos).any():
             with warnings.catch_warnings():

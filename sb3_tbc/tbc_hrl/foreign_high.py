@@ -35,7 +35,7 @@ class ForeignHigh:
 
 
 def refuse_reconsidering(agent: Any) -> None:
-    """See that the agent's high level can be replaced by another algorithm.
+    """Check that the agent's high level can be replaced by another algorithm.
 
     :param agent: a :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`
     :raises ValueError: if that high level also ends windows

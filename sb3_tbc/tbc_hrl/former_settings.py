@@ -13,11 +13,11 @@ FORMER_NAMES = {"high_settings": "high", "low_settings": "low"}
 """Attributes of version 0.1.0 and the sections that they have become."""
 
 RETIRED: dict[str, tuple[Any, ...]] = {"hindsight_goals": ("all",), "low.near_misses": (0, None)}
-"""Settings that there are no longer, and the values under which leaving them out changes nothing."""
+"""Settings that no longer exist, each with the values for which leaving it out changes nothing."""
 
 LEVEL_NAMES = ("actor_learning_rate", "batch_size", "buffer_size", "ent_coef", "gamma", "policy_kwargs", "tau",
                "target_entropy", "average_decay", "ent_coef_learning_rate", "learning_rate")  # fmt: skip
-"""What Stable-Baselines3 takes at the top and an agent of two levels for each of them."""
+"""Settings that Stable-Baselines3 takes for the whole agent, and an agent of two levels for each level."""
 
 
 def check_top_names(given: PlainMapping) -> None:
@@ -74,7 +74,7 @@ def _drop_retired(settings: Plain, attributes: Plain) -> None:
         value = holder.pop(key)
         if value not in harmless:
             warnings.warn(
-                f"the agent was trained with {name}={value!r}, a setting that there is no longer: it acts as before, "
-                "but goes on learning without it",
+                f"the agent was trained with {name}={value!r}, a setting that no longer exists: it acts as before, "
+                "but learns without it from now on",
                 stacklevel=2,
             )

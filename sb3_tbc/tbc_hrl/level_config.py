@@ -57,12 +57,12 @@ class PolicyConfig(Settings):
     activation_fn: Literal["relu", "tanh", "silu", "elu"] | type[nn.Module] = "relu"
     """Activation of the hidden layers, by name; in Python the torch class is taken as well."""
     n_critics: Annotated[int, Range(1, 100)] = 2
-    """Critics of which the lowest value counts."""
+    """Number of critics; the lowest of their values counts."""
     negative_critic: bool | None = None
-    """Keep the critics' values below zero (HiTS's force_negative), for rewards that are never positive; none: on the
-    high level yes, on the low level where ``low_reward`` is ``step``."""
+    """Keep the critics' values below zero (HiTS's force_negative), for rewards that are never positive; none: yes on
+    the high level, on the low level only with ``low_reward: step``."""
     mean_bound: Positive | None = 3.0
-    """The actor's mean is clamped to plus or minus this before squashing, as in HiTS; none does not clamp it."""
+    """The actor's mean is clamped to plus or minus this before squashing, as in HiTS; none: it is not clamped."""
     log_std_bounds: Annotated[tuple[float, float], Increasing()] = (-6.9, 1.8)
     """Bounds of the logarithm of the actor's standard deviation; the default is HiTS's 0.001 to 6."""
 
@@ -118,8 +118,8 @@ class CircuitConfig(Settings):
     dynamics: Literal["conductance", "dissipative"] = "conductance"
     """Neuron model: membrane potentials with conductances, or the dissipative cell of equations 20 and 21."""
     synapses: Literal["paper", "lean"] = "paper"
-    """Synapse model: a conductance and a reversal potential each, or one parameter each, with inputs acting through the
-    input current alone."""
+    """Synapse model. ``paper``: a conductance and a reversal potential for each synapse. ``lean``: one parameter for
+    each synapse, and inputs act through the input current alone."""
     sensory_to: tuple[Literal["inter", "command", "motor"], ...] = ("inter",)
     """Layers that sensory neurons project to; a second and third one add reflexes, which skip layers."""
     time_constants: TimeConstants | None = None
@@ -131,9 +131,9 @@ class CircuitConfig(Settings):
     readout: Literal["all", "motor"] = "all"
     """Neurons that actions are read from: all of them, as in the paper's equation, or the motor neurons."""
     max_rho: Annotated[float, Range(0, 1, above=True)] | None = None
-    """Largest contraction factor of the dissipative cell, kept during training; none leaves it free."""
+    """Largest contraction factor of the dissipative cell, enforced during training; none: no limit."""
     adaptive_step: bool | StepRule = False
-    """Choose the number of sub-steps by the step-size rule (equation 17): yes, or some of the rule's own settings."""
+    """Choose the number of sub-steps by the step-size rule (equation 17): true, or a section with its settings."""
 
     def check(self) -> None:
         """Refuse what cannot be meant together."""
@@ -161,25 +161,25 @@ class LowPolicyConfig(PolicyConfig):
     """Networks of the low level."""
 
     ndbc: CircuitConfig | None = CircuitConfig()
-    """The circuit that acts; null takes an MLP in its place."""
+    """The circuit that acts; null: an MLP acts in its place."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LevelConfig(Settings):
-    """What both levels have; names as in Stable-Baselines3's SAC."""
+    """Settings that both levels have; names as in Stable-Baselines3's SAC."""
 
     learning_rate: LearningRate = 2e-3
     """Learning rate of critics, actor and temperature; ``lin_<rate>`` falls linearly to zero at the end of training."""
     actor_learning_rate: LearningRate | None = None
-    """Learning rate of the actor where it differs; circuits take larger steps than critics."""
+    """Learning rate of the actor; none: ``learning_rate``. Circuits need larger ones than critics."""
     ent_coef_learning_rate: Positive | None = None
-    """Learning rate of the automatic temperature where it differs."""
+    """Learning rate of the automatic temperature; none: ``learning_rate``."""
     average_decay: Annotated[float, Range(0, 1, below=True)] = AVERAGE_DECAY
     """Decay per update of the averaged actor, which acts where deterministic actions are asked for; 0: no average."""
     batch_size: Annotated[int, Range(1, 1_000_000)] = 256
     """Transitions of each update."""
     gradient_ratio: UpdateRatio | None = None
-    """Updates per environment step where they differ from the agent's ``gradient_ratio``."""
+    """Updates of this level per environment step; none: the agent's ``gradient_ratio``."""
     gamma: Fraction = 0.99
     """Discount: of the high level per decision, of the low level per environment step."""
     tau: Annotated[float, Range(0, 1, above=True)] = 0.0125
@@ -218,8 +218,8 @@ class LowConfig(LevelConfig):
     """The low level, which executes subgoals."""
 
     n_hindsight_goals: Annotated[float, Range(0, 1e6)] | None = None
-    """Hindsight subgoals for each transition, where not the agent's ``n_hindsight_goals``; may be a fraction."""
+    """Number of hindsight subgoals for each transition, may be fractional; none: the agent's ``n_hindsight_goals``."""
     goal_strategy: Literal["future", "episode"] | None = None
-    """Where hindsight subgoals come from if not as the agent's ``goal_strategy`` says; ``low_reward: step`` only."""
+    """Where hindsight subgoals come from; none: as the agent's ``goal_strategy``. For ``low_reward: step`` only."""
     policy_kwargs: LowPolicyConfig = LowPolicyConfig()
     """Networks of the level; the circuit among them."""

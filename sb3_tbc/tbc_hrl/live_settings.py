@@ -40,8 +40,8 @@ class LiveSettings(PlainMapping):
         if key not in CHANGEABLE:
             raise SettingError(
                 f"{self._name}.{key}",
-                f"is chosen when the agent is made or loaded: load(path, {self._name}={{{key!r}: ...}}) changes it; "
-                f"later only {', '.join(CHANGEABLE)} can",
+                f"is fixed when the agent is made or loaded: to change it, load(path, {self._name}={{{key!r}: ...}}); "
+                f"an existing agent lets you set only {', '.join(CHANGEABLE)}",
             )
         self._change(key, value)
 

@@ -28,7 +28,7 @@ class OptionEnv(VecEnvWrapper):
     the high level's (paper section 4.1, without completion bonus), ``info["discount"]`` the factor of the next state's
     value, for algorithms that use it, and ``info["option"]`` says what happened. Episodes end as the agent's do.
 
-    Options last differently long, so that each environment is stepped by itself until its option is over::
+    Options differ in length, so each environment is stepped by itself until its option is over::
 
         venv = OptionEnv(make_vec_env("sb3_tbc/Pendulum-v0", 4), agent)
         high = PPO("MlpPolicy", venv).learn(50_000)

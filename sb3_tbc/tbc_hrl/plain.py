@@ -84,7 +84,7 @@ def decode(data: Any, depth: int = 0) -> Any:
 def reference(thing: Any) -> str:
     """Module and name of a class or function.
 
-    :raises NotPlainError: if it is not found under that name, or the module is of others
+    :raises NotPlainError: if it is not found under that name, or its module belongs to another package
     """
     name = f"{thing.__module__}:{thing.__qualname__}"
     if find(name) is not thing:
@@ -95,7 +95,7 @@ def reference(thing: Any) -> str:
 def find(name: str) -> Any:
     """The class or function of a reference.
 
-    :raises NotPlainError: if the module is of others, or holds no class or function of that name
+    :raises NotPlainError: if the module belongs to another package, or holds no class or function of that name
     """
     module, _, path = str(name).partition(":")
     if not (module.startswith(HOMES) or _running(module)) or not all(

@@ -23,8 +23,8 @@ from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.reachability import Reachability
 
 logger = logging.getLogger(__name__)
-NOT_KNOWN = "the environments begin new episodes: what ran in them when the run was saved is not known"
-ELSEWHERE = "the environments begin new episodes: living through the saved ones led elsewhere"
+NOT_KNOWN = "the environments begin new episodes: those that ran when the run was saved were not recorded"
+ELSEWHERE = "the environments begin new episodes: replaying the saved ones led to other observations"
 
 
 class LearningState(NamedTuple):
@@ -87,11 +87,10 @@ def get_state(learning: LearningState) -> Arrays:
 
 
 def set_state(learning: LearningState, state: Mapping[str, AnyArray]) -> bool:
-    """Go on where :func:`get_state` was taken; False if the state is of another moment, and nothing was changed.
+    """Restore what :func:`get_state` gave; False, with nothing changed, if the agent was saved at another moment.
 
-    The log says so: weights and replay of different moments make a run that goes on, but not the one that was saved.
-    Where the environments cannot be brought back to where they were, everything else goes on and they begin new
-    episodes, which the log says.
+    Then the log says that the run continues, but not exactly as the saved one would have. If the environments cannot be
+    brought back to their state, everything else is restored and they begin new episodes; the log says that, too.
     """
     plain = json.loads(str(state["plain"])) if "plain" in state else {}
     if plain.get("timesteps") != learning.num_timesteps:
@@ -158,16 +157,16 @@ def get_flat_state(model: OffPolicyAlgorithm) -> Arrays:
 
 
 def can_go_on(model: OffPolicyAlgorithm, state: Mapping[str, AnyArray]) -> bool:
-    """Whether a saved run's episodes can be gone on with."""
+    """Whether a saved run's episodes can be continued."""
     plain = json.loads(str(state["plain"])) if "plain" in state else {}
     known = isinstance(model.env, GoalVecEnv) and len(plain.get("episodes", ())) == model.n_envs
     return known and plain["timesteps"] == model.num_timesteps
 
 
 def set_flat_state(model: OffPolicyAlgorithm, env: VecEnv, state: Mapping[str, AnyArray]) -> bool:
-    """Go on where :func:`get_flat_state` was taken; False if living through the saved episodes led elsewhere.
+    """Restore what :func:`get_flat_state` gave; False if replaying the saved episodes led to other observations.
 
-    Those are then over, and new ones begin, which the log says; as it does where nothing is known of them.
+    The environments then begin new episodes, and the log says so; likewise if the episodes were not recorded.
     """
     if not can_go_on(model, state) or not isinstance(env, GoalVecEnv):
         logger.warning(NOT_KNOWN)

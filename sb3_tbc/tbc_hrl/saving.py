@@ -1,4 +1,4 @@
-"""Saving agents so that loading them runs no code, and loading them so."""
+"""Saving agents in a form that can be loaded without running code, and loading it."""
 
 from __future__ import annotations
 
@@ -68,11 +68,11 @@ class PlainAlgorithm(BaseAlgorithm):
         trust: bool = False,
         **kwargs: Any,
     ) -> SelfPlain:
-        """Load an agent, see SB3, without running anything that the file brings along.
+        """Load an agent, see SB3, without running any code from the file.
 
         :param trust: also unpickle what has no plain form, as SB3 always does: agents of versions up to 0.1, policy
-            classes and subgoal functions of your own. Say so for files alone whose origin you trust: unpickling can
-            run any code.
+            classes and subgoal functions of your own. Use it only for files whose origin you trust: unpickling can run
+            any code.
         :raises UntrustedError: if the file holds something that must be unpickled, unless ``trust`` is given
         :raises ConfigError: if the file is damaged or no agent
         """

@@ -61,7 +61,7 @@ class TBCHRL(TwoLevelSaving):
 
     :param policy: ``"MultiInputPolicy"``
     :param env: a goal environment or its id; its ``subgoals`` attribute says what the high level may ask for
-    :param arguments: settings; ``subgoals``, the subgoal space, for environments that do not bring one; and
+    :param arguments: settings; ``subgoals``, the subgoal space, for environments without an attribute of this name; and
         Stable-Baselines3's ``seed, device, verbose, tensorboard_log, stats_window_size``
     :raises ConfigError: on an unknown setting or a value that it cannot have
     :raises ValueError: if the environment has no goals, no subgoals or no time limit
@@ -96,7 +96,7 @@ class TBCHRL(TwoLevelSaving):
         self.reward_range: RewardRange | None = None
         self._n_updates = 0
         self._updated_at = 0
-        self._owed: dict[str, float] = {}  # parts of updates, by who is owed them
+        self._owed: dict[str, float] = {}  # updates still to be done, by level; may be fractions
         self._burst_due = False  # an episode was stored since the last updates
         self.stop_requested = False
         self.collector: Collector | None = None
@@ -205,7 +205,7 @@ class TBCHRL(TwoLevelSaving):
         )  # fmt: skip
 
     def set_random_seed(self, seed: int | None = None) -> None:
-        """Draw everything that comes from the beginning of these random streams, see SB3."""
+        """Restart all random streams from a seed, see SB3."""
         super().set_random_seed(seed)
         if seed is not None and "diagnostics" in self.__dict__:  # all parts are there
             resume.reseed(self._moving_parts(), seed)
@@ -229,7 +229,7 @@ class TBCHRL(TwoLevelSaving):
         return BaseAlgorithm._wrap_env(in_goal_vec_env(env) if monitor_wrapper else env, verbose, monitor_wrapper)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
-        """Learn in another environment from now on, see SB3; episodes that run in the present one are left.
+        """Learn in another environment from now on, see SB3; episodes that run in the present one are abandoned.
 
         :raises ValueError: if the environment does not fit the agent
         """
@@ -241,8 +241,8 @@ class TBCHRL(TwoLevelSaving):
     # ------------------------------------------------------------------ learning
 
     stop_requested: bool
-    """Set it, from a signal handler or another thread, to make :meth:`learn` return as soon as all is at a point to go
-    on from exactly; it stays set until it is taken back."""
+    """Set it, from a signal handler or another thread, to make :meth:`learn` return at the next point from which
+    learning can be continued exactly; it stays set until you set it to False."""
 
     @property
     def actor(self) -> TwoLevelActor:
@@ -260,9 +260,9 @@ class TBCHRL(TwoLevelSaving):
     ) -> SelfTBCHRL:
         """Collect whole episodes, then update both levels in a burst, until ``total_timesteps`` steps are done.
 
-        With ``reset_num_timesteps=False`` running episodes, open options and updates that are owed go on from the last
-        call: several short calls learn what one long one does. Updates follow finished episodes only, so that those
-        owed for the steps of an episode that is cut off by the end of a call are done in the next.
+        With ``reset_num_timesteps=False`` a call continues the last one, with its running episodes, open options and
+        updates still to be done: several short calls learn what one long one does. Updates follow finished episodes
+        only, so the steps of an episode that the end of a call cuts off get their updates in the next call.
 
         Setting :attr:`stop_requested` makes it return between two steps, never in the middle of a burst.
 
@@ -295,7 +295,7 @@ class TBCHRL(TwoLevelSaving):
         return self
 
     def _collect_from(self, env: VecEnv, anew: bool, resumed: PlainMapping) -> Collector:
-        """What acts in the environments: the one that did so before, unless they begin new episodes.
+        """The collector that acts in the environments: that of the last call, unless they begin new episodes.
 
         :param anew: they were just reset
         :param resumed: what was loaded of a saved run
@@ -365,9 +365,9 @@ class TBCHRL(TwoLevelSaving):
         }  # fmt: skip
 
     def train(self) -> None:
-        """Update both levels as often as ``gradient_ratio`` and the steps since the last time say.
+        """Do the updates of both levels that ``gradient_ratio`` gives for the steps since the last call.
 
-        What is less than an update, or has to wait until a buffer holds a batch, stays owed.
+        Fractions of an update, and updates that wait until a buffer holds a batch, are kept for later.
         """
         steps = max(self.num_timesteps - max(self._updated_at, self.config.learning_starts), 0)
         self._updated_at = self.num_timesteps
@@ -386,15 +386,15 @@ class TBCHRL(TwoLevelSaving):
             self.logger.record("reachability/loss", loss)
 
     def _owed_updates(self, name: str, more: float) -> int:
-        """Whole updates owed by now.
+        """Number of whole updates to do now.
 
-        :param more: that are owed for the steps since the last time
+        :param more: updates for the steps since the last call
         """
         self._owed[name] = self._owed.get(name, 0.0) + more
         return int(self._owed[name])
 
     def _updates_of(self, level: LevelConfig, steps: int) -> int:
-        """How often a level with these settings is updated for so many environment steps."""
+        """Number of updates of a level with these settings for a number of environment steps."""
         return int(self._ratio_of(level) * steps)
 
     def _ratio_of(self, level: LevelConfig) -> float:
@@ -424,8 +424,8 @@ class TBCHRL(TwoLevelSaving):
     def from_levels(cls, high: BaseAlgorithm, low: TBCHRL) -> TBCHRL:
         """An agent whose high level is another algorithm's policy, for ``predict``, evaluation and export.
 
-        It shares the low level with ``low`` and is neither trained nor saved: save the two parts instead, and put them
-        together again.
+        It shares the low level with ``low`` and can be neither trained nor saved: save the two parts instead, and call
+        this again after loading them.
 
         :param high: trained in an :class:`~sb3_tbc.tbc_hrl.option_env.OptionEnv` with ``low``
         :param low: the agent that executes the options

@@ -1,4 +1,4 @@
-"""What an agent of two levels saves and loads: parameters of both levels, replay, all that learning goes on from."""
+"""What an agent of two levels saves and loads: parameters of both levels, replay, and the state of learning."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
 
 class TwoLevelSaving(PlainAlgorithm):
-    """An agent of two levels, as far as saving and loading it goes; the agent itself builds the parts named here."""
+    """Saving and loading of an agent of two levels; the agent itself builds the parts named here."""
 
     policy: TBCPolicy
     high: SACLevel

@@ -323,7 +323,7 @@ def test_agents_saved_by_the_first_version_load(tmp_path: Path) -> None:
 
 def test_retired_settings_of_saved_agents_are_told_once(tmp_path: Path) -> None:
     make().save(tmp_path / "old")
-    with pytest.warns(UserWarning, match="hindsight_goals='asked', a setting that there is no longer") as told:
+    with pytest.warns(UserWarning, match="hindsight_goals='asked', a setting that no longer exists") as told:
         TBCHRL.load(as_version_0_1_0(tmp_path / "old.zip", hindsight_goals="asked"))
     assert len(told) == 1
 
@@ -341,7 +341,7 @@ def test_load_changes_settings_or_refuses(tmp_path: Path) -> None:
     loaded.low_settings["learning_rate"] = 1e-3
     assert (loaded.low.lr_schedule(1.0), loaded.config.low.learning_rate) == (1e-3, 1e-3)
     assert loaded.settings["low"]["learning_rate"] == 1e-3
-    with pytest.raises(ValueError, match=r"low\.gamma is chosen when the agent is made or loaded"):
+    with pytest.raises(ValueError, match=r"low\.gamma is fixed when the agent is made or loaded"):
         loaded.low_settings["gamma"] = 0.5
     with pytest.raises(ValueError, match=r"low\.tau must be a number above 0"):
         loaded.low_settings["tau"] = 2
