@@ -32,7 +32,9 @@ LAYERS = (
 LAYER = {name: index for index, names in enumerate(LAYERS) for name in names}
 
 TASK_PACKAGES = {"gymnasium", "gymnasium_robotics", "numpy", "mujoco", "Box2D", "pybullet", "tkinter", "pygame"}
-GIVEN_TO_TASKS = ("sb3_tbc.smdp.spaces", "sb3_tbc.smdp.goal_spaces", "sb3_tbc.smdp.goal_test", "sb3_tbc.errors")
+GIVEN_TO_TASKS = tuple(
+    f"sb3_tbc.{name}" for name in ("aliases", "arrays", "smdp.spaces", "smdp.goal_spaces", "smdp.goal_test", "errors")
+)
 NO_TORCH = (
     "sb3_tbc.arrays",
     "sb3_tbc.smdp.goal_spaces",
