@@ -11,6 +11,7 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
+from sb3_tbc.pretrained import model_path
 from sb3_tbc.zoo.config import CONFIGS
 from sb3_tbc.zoo.ledger import to_json
 
@@ -19,6 +20,7 @@ EXAMPLES = {
     "sb3_tbc.benchmark cells --json cells.json": "the circuit beside LTC, CfC and GRU",
     "sb3_tbc.benchmark parameters": "sizes of the circuits of table A1",
     "sb3_tbc.benchmark fit --tasks Pendulum --actors lean mlp --steps 500 2000": "what actors learn by imitation",
+    "sb3_tbc.benchmark robustness pretrained:Pendulum": "a trained agent under noise, late actions and other physics",
 }
 JSON_HELP = "write the figures to this file, too"
 
@@ -33,6 +35,7 @@ def build_parser() -> Parser:
     parameters.add_argument("--json", metavar="OUT", help=JSON_HELP)
     _add_train(commands)
     _add_fit(commands)
+    _add_robustness(commands)
     return parser
 
 
@@ -66,6 +69,16 @@ def _add_fit(commands: Any) -> None:
     record.add_argument("--every", type=positive_int, default=3, help="take every so many steps")
     record.add_argument("--json", metavar="OUT", help=JSON_HELP)
     add_trust(record)
+
+
+def _add_robustness(commands: Any) -> None:
+    robustness = commands.add_parser("robustness", help="agents under noise, late actions and changed physics")
+    robustness.add_argument("models", nargs="+", type=model_path, metavar="MODEL.zip", help="agents of one task, shown "
+                            "side by side; pretrained:TASK is one that comes with the package")  # fmt: skip
+    robustness.add_argument("--n-episodes", type=positive_int, default=100, help="episodes under each disturbance")
+    robustness.add_argument("--seed", type=int, default=0, help="seed of the episodes")
+    robustness.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    add_trust(robustness)
 
 
 def _add_train(commands: Any) -> None:
@@ -103,6 +116,10 @@ def _measure(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
         from sb3_tbc.benchmark import fit as benchmark_fit
 
         return benchmark_fit.fit(arguments)
+    if arguments.subject == "robustness":
+        from sb3_tbc.benchmark import robustness as benchmark_robustness
+
+        return benchmark_robustness.robustness(arguments)
     if arguments.subject == "record":
         return _record(arguments)
     if arguments.subject == "train":
