@@ -206,7 +206,10 @@ class SubgoalReplayBuffer(RingBuffer):
             early = self.rng.random(len(where), dtype=np.float32)
             time_left[where, 0] = ahead + 1 - (0.0 if self.rules.whole_budgets else early)
         here, achieved = taken["here"], taken["achieved"]
-        rewards[where, 0], dones[where, 0] = self._relabelled(here[where], achieved[where], subgoal[where], expired)
+        may_end = taken["position"][where, 0] + 1 >= self.rules.dt_min
+        rewards[where, 0], dones[where, 0] = self._relabelled(
+            here[where], achieved[where], subgoal[where], expired, may_end
+        )
         scale = np.float32(1.0 / self.rules.dt_max)
         now, later = (np.clip(t * scale, 0.0, 1.0) for t in (time_left, time_left - 1.0))
         observations = self.views.low_from(taken["local"], here, subgoal, now)
@@ -246,12 +249,17 @@ class SubgoalReplayBuffer(RingBuffer):
         return at, where, (begin[where] + second) % self.buffer_size
 
     def _relabelled(
-        self, here: Float32, achieved: Float32, subgoal: Float32, expired: NDArray[np.bool_]
+        self,
+        here: Float32,
+        achieved: Float32,
+        subgoal: Float32,
+        expired: NDArray[np.bool_],
+        may_end: NDArray[np.bool_],
     ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
         """Rewards and ends of relabelled steps."""
         if self.reward.kind == "sparse" and not self.rules.ends_when_reached:
             return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
-        return self.reward.rewards_and_ends(here, achieved, subgoal, expired)
+        return self.reward.rewards_and_ends(here, achieved, subgoal, expired, may_end)
 
     def _states(
         self, at: NDArray[np.int64], taken: dict[str, Float32], observations: Float32

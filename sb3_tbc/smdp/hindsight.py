@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.arrays import BoolArray, FloatArray
-from sb3_tbc.smdp.options import Episode, OptionRules
+from sb3_tbc.smdp.options import Episode, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
@@ -184,6 +184,19 @@ def _rows(episode: Episode, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
     }
 
 
+def failed_tests(episode: Episode) -> BoolArray:
+    """Which options tested their subgoal and missed it, ``(n_options,)``; not one that the task's success cut off."""
+    last = len(episode.options) - 1
+    return np.array(
+        [
+            option.testing
+            and not option.reached
+            and not (i == last and episode.success and option.reason is TerminationReason.EPISODE_END)
+            for i, option in enumerate(episode.options)
+        ]
+    )
+
+
 def goal_pairs(
     n_options: int, n_goals: int, strategy: str, rng: np.random.Generator, event: int | None = None
 ) -> NDArray[np.int64]:
@@ -221,6 +234,8 @@ def high_level_steps(
     testing transitions (failed tests, chosen action, penalty), hindsight-action transitions of all options, and
     copies of these with hindsight goals.
 
+    A test that the task's success cut off has not failed: its subgoal was not needed any more.
+
     :param high_view: maps goal observations to the high level's flat observation
     """
     actions, changed = relabel_actions(episode, subgoals, rules, rng, settings.tolerance)
@@ -251,7 +266,7 @@ class _Options:
         self.ends = self.starts + self.durations
         self.chosen = np.stack([option.unit_action for option in options])
         self.reached = np.array([option.reached for option in options])
-        self.testing = np.array([option.testing for option in options])
+        self.failed_test = failed_tests(episode)
         self.actions, self.changed = actions, changed
         self.before, self.after = _rows(episode, self.starts), _rows(episode, self.ends)
         self.local, self.here = subgoals.local(self.before), subgoals.achieved(self.before)
@@ -282,20 +297,20 @@ class _TransitionSource:
     def failed_tests(self, penalty: float) -> HighLevelSteps:
         """Failed tests of subgoals, under the actions that were chosen, with the penalty as reward."""
         o = self.options
-        rows = np.flatnonzero(o.testing & ~o.reached)
+        rows = np.flatnonzero(o.failed_test)
         return self._steps(rows, o.chosen[rows], np.full(len(rows), penalty), o.dones[rows], o.durations[rows], False)
 
     def as_chosen(self) -> HighLevelSteps:
         """Options that hindsight changes, as they were chosen; failed tests have their penalty instead."""
         o = self.options
-        rows = np.flatnonzero(o.changed & ~o.testing)
+        rows = np.flatnonzero(o.changed & ~o.failed_test)
         charged = self._charged(self.rewards[rows], o.chosen[rows])
         return self._steps(rows, o.chosen[rows], charged, o.dones[rows], o.durations[rows], False)
 
     def as_relabelled(self) -> HighLevelSteps:
         """All options under their hindsight actions; a failed test that has none only has its penalty."""
         o = self.options
-        rows = np.flatnonzero(o.reached | o.changed | ~o.testing)
+        rows = np.flatnonzero(o.reached | o.changed | ~o.failed_test)
         gained = self._charged(self.rewards, o.actions) + self.bonus
         return self._steps(rows, o.actions[rows], gained[rows], o.dones[rows], o.durations[rows], True)
 

@@ -150,7 +150,7 @@ def make_high_level(
     """The level that chooses subgoals and time budgets."""
     policy_kwargs = config.high.policy_kwargs.to_kwargs()
     if policy_kwargs["negative_critic"] is None:
-        policy_kwargs["negative_critic"] = True
+        policy_kwargs["negative_critic"] = not config.bonus_beyond_cost
     return _make_level("high", config, config.high, ends, policy_kwargs, seed, device, bounds)
 
 

@@ -190,6 +190,21 @@ class TBCConfig(AgentConfig):
                 f"{self.low.goal_strategy!r} has an effect with low_reward='step' alone, here it is "
                 f"{self.low_reward!r}: hindsight subgoals that depend on time come from the same window",
             )
+        if self.high.policy_kwargs.negative_critic and self.bonus_beyond_cost:
+            price = f"decision_cost={self.decision_cost:g}" if self.target == "smdp" else "target='decision'"
+            raise SettingError(
+                "completion_bonus",
+                f"of {self.completion_bonus:g} with {price} makes rewards above zero, which a high level's critic with "
+                "policy_kwargs.negative_critic=True cannot learn: leave negative_critic out, or use a smaller bonus",
+            )
+
+    @property
+    def bonus_beyond_cost(self) -> bool:
+        """Whether the completion bonus can make a decision's reward positive, for a task whose rewards never are.
+
+        With ``target: smdp`` a decision has its price; with ``target: decision`` the reward of a success is 0 already.
+        """
+        return self.completion_bonus > (self.decision_cost if self.target == "smdp" else 0.0)
 
     def warn_before_learning(self) -> None:
         """Say so where a replay buffer holds less than a batch: its level would never be updated."""

@@ -60,7 +60,8 @@ class PolicyConfig(Settings):
     """Number of critics; the lowest of their values counts."""
     negative_critic: bool | None = None
     """Keep the critics' values below zero (HiTS's force_negative), for rewards that are never positive; none: yes on
-    the high level, on the low level only with ``low_reward: step``."""
+    the high level unless ``completion_bonus`` is more than a decision costs, on the low level only with
+    ``low_reward: step``."""
     mean_bound: Positive | None = 3.0
     """The actor's mean is clamped to plus or minus this before squashing, as in HiTS; none: it is not clamped."""
     log_std_bounds: Annotated[tuple[float, float], Increasing()] = (-6.9, 1.8)

@@ -267,6 +267,26 @@ def test_flat_mistakes_are_told_likewise() -> None:
             FlatSAC("MultiInputPolicy", Corridor(), **given)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("given", "positive"),
+    [
+        ({"target": "smdp", "completion_bonus": 1.0, "decision_cost": 1.0}, False),
+        ({"target": "smdp", "completion_bonus": 1.5, "decision_cost": 1.0}, True),
+        ({"target": "decision", "completion_bonus": 0.25}, True),
+        ({"target": "decision"}, False),
+    ],
+)
+def test_a_bonus_and_a_critic_that_cannot_be_positive_exclude_each_other(given: dict[str, Any], positive: bool) -> None:
+    model = TBCHRL("MultiInputPolicy", Corridor(), compile=False, **given)
+    assert model.high.policy.critic.negative is not positive
+    high = {"policy_kwargs": {"negative_critic": True}}
+    if positive:
+        with pytest.raises(ConfigError, match=r"completion_bonus of .* makes rewards above zero"):
+            TBCHRL("MultiInputPolicy", Corridor(), high=high, **given)
+    else:
+        assert TBCHRL("MultiInputPolicy", Corridor(), high=high, compile=False, **given).high.policy.critic.negative
+
+
 def test_mappings_dataclasses_and_numpy_numbers_are_taken() -> None:
     low = LowConfig(gamma=0.9, policy_kwargs=LowPolicyConfig(net_arch=(8,), ndbc=None))
     model = TBCHRL("MultiInputPolicy", Corridor(), low=low, high=HighConfig(batch_size=8), max_options=np.int64(5))

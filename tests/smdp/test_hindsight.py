@@ -11,6 +11,7 @@ from corridor import Corridor
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.smdp.hindsight import (
     GoalTest,
+    HighLevelSteps,
     HindsightSettings,
     check_goal_strategy,
     goal_pairs,
@@ -138,6 +139,44 @@ def test_all_high_level_transitions_by_hand() -> None:
     np.testing.assert_allclose(steps.discounts, 0.9)
 
 
+def high_steps(of: Episode, duration_cost: float = 0.0, keep_original: bool = False) -> HighLevelSteps:
+    reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=duration_cost)
+    settings = HindsightSettings(0, "future", -5.0, keep_original=keep_original)
+    return high_level_steps(of, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
+
+
+def test_a_reached_test_is_not_punished() -> None:
+    options = (option(0, 3, 0.9, 2.5, True, False), option(3, 2, 0.5, 1.5, True, True))
+    steps = high_steps(episode()._replace(options=options))
+    assert steps.rewards.tolist() == [-5.0, -1.0, 0.0]  # the first failed, and what became of both
+    assert steps.actions[0, 0] == pytest.approx(0.9)
+
+
+@pytest.mark.parametrize(
+    ("reason", "success", "punished"),
+    [
+        (TerminationReason.EPISODE_END, True, 1),  # success came before the budget was spent
+        (TerminationReason.EPISODE_END, False, 2),  # the time limit
+        (TerminationReason.EXPIRED, True, 2),  # its own time was up as well
+    ],
+)
+def test_a_test_that_success_cuts_off_has_not_failed(reason: TerminationReason, success: bool, punished: int) -> None:
+    cut = option(3, 2, -0.9, 3.5, True, False)._replace(reason=reason)
+    options = (option(0, 3, 0.9, 2.5, True, False), cut)
+    steps = high_steps(episode()._replace(options=options, success=success), keep_original=True)
+    assert (steps.rewards == -5.0).sum() == punished
+    kept = np.isclose(steps.actions[:, 0], -0.9) & (steps.rewards > -5.0)
+    assert kept.sum() == (punished == 1)  # what was asked for is learned from as of any option that was no test
+
+
+def test_originals_pay_for_their_time_too() -> None:
+    options = (option(0, 3, 0.9, 2.5, False, False), option(3, 2, 0.5, 1.5, False, True))
+    steps = high_steps(episode()._replace(options=options), duration_cost=2.0, keep_original=True)
+    took = RULES.budget(steps.actions[:, 1])
+    assert took[0] == pytest.approx(2.5)
+    np.testing.assert_allclose(steps.rewards, np.array([-1.0, -1.0, 0.0]) - 2.0 * took / 4.0)
+
+
 def test_ordered_pairs_are_uniform() -> None:
     rng = np.random.default_rng(0)
     first, second = ordered_pairs(np.full(60_000, 3), rng)
@@ -164,6 +203,26 @@ def test_relabelled_low_level_samples_are_consistent() -> None:
     assert ((left > ahead - 1) & (left <= ahead)).all()
     np.testing.assert_array_equal(rewards, ahead == 1)
     np.testing.assert_array_equal(batch.dones[0, :, 0].numpy(), rewards)
+    later = batch.next_observations[0].numpy()
+    np.testing.assert_allclose(later[:, 0], position + 0.1, atol=1e-6)
+    np.testing.assert_array_equal(later[:, 3], subgoal)  # the next step is asked for the same
+    np.testing.assert_allclose(later[:, 4] * RULES.dt_max, np.maximum(left - 1, 0), atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["sparse", "dense"])
+def test_relabelled_windows_do_not_end_before_dt_min(kind: str) -> None:
+    """A point that stands still is at its subgoal from the first step on; the window may end from the second on."""
+    rules = OptionRules(dt_max=4.0, dt_min=2.0, max_options=5, window_end="reached")
+    still = episode()._replace(observation=np.stack([np.zeros(6), np.arange(6.0), np.ones(6)], axis=1))
+    buffer = low_buffer(100, hindsight=1e9, rules=rules, reward=LowLevelReward(kind, ENV.subgoals, rules))
+    buffer.extend(low_level_steps(still._replace(achieved_goal=np.zeros((6, 1))), ENV.subgoals, rules))
+    batch = buffer.sample_burst(1, 500)
+    step, left = batch.observations[0, :, 1].numpy(), batch.observations[0, :, 4].numpy() * rules.dt_max
+    within = np.where(step < 3, step, step - 3)  # steps since the window began
+    over = (left <= 1.0) | (within + 1 >= rules.dt_min)
+    assert 0 < over.sum() < len(over)
+    np.testing.assert_array_equal(batch.dones[0, :, 0].numpy(), over)
+    np.testing.assert_array_equal(batch.rewards[0, :, 0].numpy(), over)
 
 
 def test_whole_budgets_are_rounded_and_last_as_long_as_they_say() -> None:

@@ -1,0 +1,70 @@
+"""The dissipative cell against equations 20 and 21, written out synapse by synapse in NumPy."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given, settings
+from numpy.typing import NDArray
+from random_nets import SEEDS, random_net
+
+from sb3_tbc.ndbc.dissipative import DissipativeCell
+from sb3_tbc.ndbc.network import NDBCNet
+
+
+def by_hand(net: NDBCNet) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """W ``(I, N)``, U ``(N, N)`` and K ``(N,)`` from the free parameters; synapses lead from row to column."""
+    cell, wiring = net.cell, net.wiring
+    assert isinstance(cell, DissipativeCell)
+    positive = {n: np.logaddexp(0, p.detach().double().numpy()) for n, p in cell.named_parameters() if n != "bias"}
+    weight, recurrent = np.zeros(wiring.sensory.shape), np.zeros(wiring.recurrent.shape)
+    for k, (i, j) in enumerate(np.argwhere(wiring.sensory)):
+        weight[i, j] = wiring.sensory[i, j] * positive["raw_input_weight"][k]
+    for k, (i, j) in enumerate(np.argwhere(wiring.recurrent)):
+        recurrent[i, j] = wiring.recurrent[i, j] * positive["raw_weight"][k]
+    return weight, recurrent, positive["raw_damping"] + cell.min_damping
+
+
+@given(SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_one_step_is_equation_20(seed: int) -> None:
+    net = random_net(seed, dynamics="dissipative", sub_steps=1)
+    weight, recurrent, damping = by_hand(net)
+    rng = np.random.default_rng(seed)
+    inputs, state = rng.normal(size=3), rng.normal(size=net.state_dim)
+    bias = net.cell.bias.detach().numpy()  # type: ignore[union-attr]
+    driven = weight.T @ (inputs * net.input_gain.numpy()) + recurrent.T @ state + bias  # what arrives at each neuron
+    expected = (state + np.tanh(driven)) / (1.0 + damping)
+    single = (th.as_tensor(x[None], dtype=th.float32) for x in (inputs, state))
+    np.testing.assert_allclose(net(*single)[1][0].detach().numpy(), expected, atol=1e-5)
+
+
+@given(SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_neurons_hear_their_presynaptic_ones_only(seed: int) -> None:
+    """Where one neuron influences another, by differentiation, the wiring has a synapse of that sign."""
+    net = random_net(seed, dynamics="dissipative", sub_steps=1)
+    state = 0.1 * th.randn(net.state_dim, generator=th.Generator().manual_seed(seed))
+    influence = th.autograd.functional.jacobian(lambda x: net(th.zeros(1, 3), x[None])[1][0], state).numpy().T
+    np.fill_diagonal(influence, 0.0)
+    np.testing.assert_array_equal(np.sign(influence), net.wiring.recurrent)
+
+
+@pytest.mark.parametrize("sub_steps", [1, 3])
+@given(seed=SEEDS)
+@settings(max_examples=20, deadline=None)
+def test_the_certificate_is_equation_21(seed: int, sub_steps: int) -> None:
+    net = random_net(seed, dynamics="dissipative", sub_steps=sub_steps)
+    weight, recurrent, damping = by_hand(net)
+    eta, certificate = 1.0 / sub_steps, net.certificate()
+    shrink = 1.0 / (1.0 + eta * damping.min())
+    gain = np.abs(net.input_gain.numpy()).max()
+    assert certificate.rho == pytest.approx(shrink * (1.0 + eta * np.linalg.norm(recurrent, 2)), rel=1e-5)
+    assert certificate.c >= shrink * eta * np.linalg.norm(weight, 2) * (1.0 if gain <= 1.0 else gain) * (1 - 1e-5)
+    bias = net.cell.bias.detach().numpy()  # type: ignore[union-attr]
+    assert certificate.d == pytest.approx(shrink * eta * np.linalg.norm(bias), rel=1e-5)
+    bound = certificate.state_bound(2.0, 0.5)
+    assert bound == (
+        np.inf if certificate.rho >= 1 else max(0.5, (certificate.c * 2 + certificate.d) / (1 - certificate.rho))
+    )

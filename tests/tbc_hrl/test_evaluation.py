@@ -1,0 +1,90 @@
+"""Evaluation: by the means of both levels, episode after episode, with the rules of training."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from corridor import Corridor
+
+from sb3_tbc import TBCHRL
+from sb3_tbc.tbc_hrl.evaluation import evaluate_agent, evaluate_hierarchical
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+from sb3_tbc.tbc_hrl.policy import TwoLevelState
+
+LEVEL: dict[str, Any] = {"batch_size": 16, "policy_kwargs": {"net_arch": [8, 8]}}
+
+
+class Same(Corridor):
+    """A corridor whose episodes all begin alike: one goal, no serial number to see."""
+
+    def __init__(self, goal: float = 0.8) -> None:
+        super().__init__(goal=goal)
+
+    def reset(self, **kwargs: Any) -> Any:
+        self.episode = 0
+        return super().reset(**kwargs)
+
+
+def make(**kwargs: Any) -> TBCHRL:
+    settings = {"high": LEVEL, "low": LEVEL, "max_options": 5, "compile": False, "seed": 0}
+    return TBCHRL("MultiInputPolicy", Corridor(), **{**settings, **kwargs})
+
+
+@pytest.mark.parametrize("window_end", ["timed", "reached"])
+def test_deterministic_evaluations_draw_nothing(window_end: str) -> None:
+    """Episodes that begin alike are the same, where there is no noise on either level."""
+    model = make(window_end=window_end)
+    env = Same()
+    result = evaluate_hierarchical(model, env, 6, seed=0)
+    for name in ("lengths", "rewards", "mean_window", "decisions", "subgoal_success"):
+        assert len(set(getattr(result, name))) == 1, name
+    noisy = evaluate_hierarchical(model, env, 6, seed=0, deterministic=False)
+    assert len(set(noisy.mean_window)) > 1
+
+
+def test_the_high_level_alone_is_deterministic_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make()
+    asked: list[bool] = []
+    propose = model.actor.propose
+
+    def listen(observations: Any, deterministic: bool, rng: Any) -> Any:
+        asked.append(deterministic)
+        return propose(observations, deterministic, rng)
+
+    monkeypatch.setattr(model.actor, "propose", listen)
+    evaluate_agent(model, Corridor(), 2, seed=0)
+    assert asked
+    assert all(asked)
+
+
+def test_flat_evaluations_draw_nothing() -> None:
+    model = FlatSAC("MultiInputPolicy", Corridor(), buffer_size=100, seed=0)
+    env = Same(goal=0.2)
+    assert len(set(evaluate_agent(model, env, 4, seed=0).rewards)) == 1
+    noisy = evaluate_agent(model, env, 4, seed=0, deterministic=False)
+    assert len(set(zip(noisy.lengths, noisy.rewards, strict=True))) > 1
+
+
+@pytest.mark.parametrize(("dt_min", "windows"), [(0.0, [1] * 8), (4.0, [1, 2, 3, 4, 1, 2, 3, 4])])
+def test_predict_keeps_to_the_shortest_time_budget(
+    dt_min: float, windows: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The subgoal is where the point stands: only ``dt_min`` keeps a window from ending at once."""
+    model = make(window_end="reached", dt_min=dt_min, dt_max=10.0)
+    monkeypatch.setattr(model.actor, "propose", lambda seen, *_: np.tile([0.0, 1.0], (len(seen), 1)))
+    observation, _ = Corridor(goal=5.0).reset(seed=0)
+    state: Any = None
+    elapsed = []
+    for _ in windows:
+        _, state = model.predict(observation, state=state, deterministic=True)
+        elapsed.append(int(TwoLevelState(*state).elapsed[0]))
+    assert elapsed == windows
+
+
+def test_predict_asks_for_no_budget_below_the_shortest(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make(dt_min=4.0, dt_max=10.0)
+    monkeypatch.setattr(model.actor, "propose", lambda seen, *_: np.tile([0.0, -1.0], (len(seen), 1)))
+    _, state = model.predict(Corridor().reset(seed=0)[0], deterministic=True)
+    assert TwoLevelState(*state).time_budget.tolist() == [4.0]
