@@ -16,5 +16,8 @@ PlainMapping = Mapping[str, Any]
 Env = gym.Env[Any, Any]
 """An environment, with observations and actions of any type."""
 
+Wrapper = gym.Wrapper[Any, Any, Any, Any]
+"""A wrapper around such an environment."""
+
 Space = gym.Space[Any]
 """A space of observations or actions."""

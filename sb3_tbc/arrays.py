@@ -13,6 +13,9 @@ AnyArray = NDArray[Any]
 FloatArray = NDArray[np.floating[Any]]
 """Floating-point numbers of any precision."""
 
+FloatType = type[np.floating[Any]]
+"""A precision, such as ``np.float32``."""
+
 Float32 = NDArray[np.float32]
 """Single precision: what networks see and replay buffers hold."""
 

@@ -62,7 +62,9 @@ FORMER_NAMES = {
 class FormerNames(MetaPathFinder, InspectLoader):
     """Finds modules under their former names; a module is imported when it is asked for, not before."""
 
-    def find_spec(self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None) -> Any:
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
         """Called by the import system; None for a name that is not a former one."""
         if fullname not in FORMER_NAMES:
             return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from typing import Any
 
 from sb3_tbc.errors import ConfigError
 
@@ -42,7 +41,7 @@ def flat_name(text: str, what: str) -> str:
     return folder_name(text.replace("/", "_").replace(":", "_") if isinstance(text, str) else text, what)
 
 
-def number(value: Any, what: str, low: float = -math.inf, high: float = math.inf) -> float:
+def number(value: object, what: str, low: float = -math.inf, high: float = math.inf) -> float:
     """Check that a value is a finite number within bounds; text and truth values are refused.
 
     :param value: as JSON or YAML gave it

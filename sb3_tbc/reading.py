@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from collections.abc import Callable
@@ -115,7 +116,7 @@ def _size(node: yaml.Node, known: dict[int, int], depth: int) -> int:
     return size
 
 
-def read_arrays(path: Any) -> Arrays:
+def read_arrays(path: str | Path | io.BufferedIOBase) -> Arrays:
     """The arrays of a file that :func:`~sb3_tbc.files.write_arrays` wrote; nothing is unpickled.
 
     :param path: of the file, or an open file

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib import import_module
 from inspect import signature
-from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import WrapperSpec
+
+from sb3_tbc.aliases import Env, PlainMapping
 
 _CLASSES = {  # module, time limit
     "Pendulum": ("pendulum", 1000),
@@ -23,7 +23,7 @@ TASKS = tuple(_CLASSES)
 """Names of the tasks; the id of each is ``sb3_tbc/<name>-v0``."""
 
 
-def make_task(task: str, perturb: Mapping[str, Any] | None = None, **kwargs: Any) -> gymnasium.Env[Any, Any]:
+def make_task(task: str, perturb: PlainMapping | None = None, **kwargs: object) -> Env:
     """Build a task; the entry point behind ``gymnasium.make("sb3_tbc/<task>-v0", **kwargs)``.
 
     :param task: one of :data:`TASKS`
@@ -34,7 +34,7 @@ def make_task(task: str, perturb: Mapping[str, Any] | None = None, **kwargs: Any
     if task not in _CLASSES:
         raise ValueError(f"task must be one of {TASKS}, got {task!r}")
     task_class = getattr(import_module(f"{__name__}.{_CLASSES[task][0]}"), task)
-    env: gymnasium.Env[Any, Any] = task_class(**kwargs)
+    env: Env = task_class(**kwargs)
     if not perturb:
         return env
     perturb_class = import_module(f"{__name__}.perturb").Perturb
@@ -42,7 +42,7 @@ def make_task(task: str, perturb: Mapping[str, Any] | None = None, **kwargs: Any
     unknown = sorted(set(perturb) - set(allowed))
     if unknown:
         raise ValueError(f"perturb has unknown keys {unknown}; allowed are {allowed}")
-    perturbed: gymnasium.Env[Any, Any] = perturb_class(env, **perturb)
+    perturbed: Env = perturb_class(env, **perturb)
     return perturbed
 
 

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
@@ -107,7 +108,7 @@ class AntFourRooms(MujocoTask):
 
     xml: ClassVar[str] = ant_xml()
     frame_skip: ClassVar[int] = 15
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}
+    metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 10}
     max_episode_steps = 700
     action_bound = (1.0,) * 8
     goal_low = (-10.0,) * 3

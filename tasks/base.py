@@ -14,6 +14,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
 from .rendering import Overlay
@@ -45,7 +47,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     :raises ValueError: for an unknown layout or render mode
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
+    metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
     max_episode_steps: int
     """Steps after which an episode is truncated, unless a ``TimeLimit`` says otherwise."""
     truncates_itself: bool = True
@@ -152,11 +154,11 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         self._spec = spec
         self.truncates_itself = spec is None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> Plain:
         """Everything but windows and handles of engines, for ``copy`` and ``pickle``."""
         return {key: value for key, value in vars(self).items() if key not in self._not_copied}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
+    def __setstate__(self, state: Plain) -> None:
         """Take over what :meth:`__getstate__` gave and connect it with an engine again."""
         self.__dict__.update(dict.fromkeys(self._not_copied), **state)
         self._reconnect()
@@ -164,9 +166,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     def _reconnect(self) -> None:
         """Make what cannot be copied, and put the physics into the state that the copied attributes tell."""
 
-    def reset(
-        self, *, seed: int | None = None, options: Mapping[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: PlainMapping | None = None) -> tuple[Observation, Plain]:
         """Start an episode.
 
         :param seed: seeds the task's own random generator
@@ -188,7 +188,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
             {"is_success": self._holds(achieved, self._goal_list)},
         )
 
-    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, Plain]:
         """Advance by one control step.
 
         :param action: in the units of ``action_space``; clipped to it
@@ -212,7 +212,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
             {"is_success": success},
         )
 
-    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: object = None) -> Any:
         """Sparse reward: 0 where the goal test holds, else -1.
 
         :param achieved_goal: ``(goal_dim,)`` or ``(..., goal_dim)``
@@ -223,12 +223,12 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         success = self._holds_batch(*_goal_pair(achieved_goal, desired_goal))
         return np.where(success, 0.0, -1.0) if np.ndim(success) else (0.0 if success else -1.0)
 
-    def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+    def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: object = None) -> Any:
         """Whether the goal test holds: a bool, or an array for a batch. See :meth:`compute_reward`."""
         success = self._holds_batch(*_goal_pair(achieved_goal, desired_goal)) & self.success_terminates
         return success if np.ndim(success) else bool(success)
 
-    def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+    def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: object = None) -> Any:
         """Whether the task itself cuts the present step: at its time limit and without success."""
         terminated = self.compute_terminated(achieved_goal, desired_goal, info)
         at_limit = self.truncates_itself and self._elapsed >= self.max_episode_steps
@@ -350,13 +350,13 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
                 return self._clipped(array)
         return values
 
-    def _clipped(self, array: NDArray[Any]) -> list[float]:
+    def _clipped(self, array: AnyArray) -> list[float]:
         if not np.all(np.isfinite(array)):
             raise ValueError(f"action must be finite, got {array}. Has the policy diverged?")
         clipped: list[float] = np.clip(array.astype(np.float64), self.action_space.low, self.action_space.high).tolist()
         return clipped
 
-    def _read_options(self, options: Mapping[str, Any]) -> tuple[Array | None, dict[str, Array]]:
+    def _read_options(self, options: PlainMapping) -> tuple[Array | None, dict[str, Array]]:
         _check_keys("options", options, ("goal", "state"))
         goal = options.get("goal")
         if goal is not None:
@@ -374,7 +374,7 @@ def _goal_pair(achieved: ArrayLike, desired: ArrayLike) -> tuple[Array, Array]:
     return achieved, desired
 
 
-def _check_keys(what: str, given: Mapping[str, Any], allowed: tuple[str, ...]) -> None:
+def _check_keys(what: str, given: PlainMapping, allowed: tuple[str, ...]) -> None:
     unknown = sorted(set(given) - set(allowed))
     if unknown:
         raise ValueError(f"{what} has unknown keys {unknown}; allowed are {list(allowed)}")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array, GoalTask
@@ -43,7 +44,7 @@ class Drawbridge(GoalTask):
     no effect.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 60}
+    metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 60}
     dynamics_names = ("actuator", "bridge")
     goal_is_fixed = True
     max_episode_steps = MAX_STEPS

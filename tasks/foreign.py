@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
-from types import SimpleNamespace
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -67,9 +67,9 @@ def mend_joint_types() -> bool:
 class _PlainJoints:
     """The module MuJoCo seen through, but for the joint types, which are integers."""
 
-    def __init__(self, module: Any) -> None:
+    def __init__(self, module: ModuleType) -> None:
         self._module = module
         self.mjtJoint = SimpleNamespace(**{k: int(v) for k, v in module.mjtJoint.__members__.items()})
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         return getattr(self._module, name)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_tbc.aliases import Env, Plain, Wrapper
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .goal_env_check import check_goal_env, goal_env_problems, name_of
@@ -40,7 +40,7 @@ class GoalEnvDescription(NamedTuple):
 
 
 def describe_goal_env(
-    env: gym.Env[Any, Any],
+    env: Env,
     low: ArrayLike | None = None,
     high: ArrayLike | None = None,
     thresholds: ArrayLike | None = None,
@@ -95,7 +95,7 @@ def describe_goal_env(
     return GoalEnvDescription(given, within, *scales, steps, success_test)
 
 
-def subgoal_space_of(env: gym.Env[Any, Any], **given: Any) -> SubgoalSpace:
+def subgoal_space_of(env: Env, **given: Any) -> SubgoalSpace:
     """The subgoal space that an environment brings, or one derived by :func:`describe_goal_env`.
 
     :param env: a goal environment
@@ -105,7 +105,7 @@ def subgoal_space_of(env: gym.Env[Any, Any], **given: Any) -> SubgoalSpace:
     return own if isinstance(own, SubgoalSpace) and not given else describe_goal_env(env, **given).subgoals
 
 
-class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
+class DescribedGoalEnv(Wrapper):
     """Gives any goal environment what our own tasks have: attributes, ``info["is_success"]``, rewards up to 0.
 
     Rewards are shifted so that the reward at the goal becomes 0: the mazes of Gymnasium-Robotics pay 1 and 0, its
@@ -122,7 +122,7 @@ class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(
         self,
-        env: gym.Env[Any, Any],
+        env: Env,
         terminate_on_success: bool = True,
         description: GoalEnvDescription | None = None,
         **given: Any,
@@ -138,13 +138,13 @@ class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
         self._best, worst = self.description.success_test.best, self.description.success_test.worst
         self.reward_range = None if worst is None else (worst - self._best, 0.0)
 
-    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+    def compute_reward(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: object = None) -> Any:
         """The environment's own reward, shifted to 0 at the goal; single or batched."""
         goals = np.asarray(achieved_goal, dtype=np.float64), np.asarray(desired_goal, dtype=np.float64)
         reward = compute_reward_of(self.env)(*goals) - self._best
         return reward if reward.ndim else float(reward)
 
-    def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any = None) -> Any:
+    def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: object = None) -> Any:
         """Whether an episode ends with this achieved goal; single or batched."""
         success = self._reached(achieved_goal, desired_goal) & self._terminate_on_success
         return success if np.ndim(achieved_goal) > 1 else bool(success)
@@ -154,7 +154,7 @@ class DescribedGoalEnv(gym.Wrapper[Any, Any, Any, Any]):
         success = self.description.success_test.function_for(self.env)(np.atleast_2d(one), np.atleast_2d(other))
         return success if one.ndim > 1 else success[0]
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: object) -> tuple[GoalObservation, SupportsFloat, bool, bool, Plain]:
         """Step; adds ``is_success``, shifts the reward, ends the episode with success."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         success = said_success(info)
@@ -176,7 +176,7 @@ def _extent(probe: Probe) -> tuple[Floats, Floats]:
 
 
 def _bounds(
-    env: gym.Env[Any, Any], extent: tuple[Floats, Floats], low: ArrayLike | None, high: ArrayLike | None
+    env: Env, extent: tuple[Floats, Floats], low: ArrayLike | None, high: ArrayLike | None
 ) -> tuple[Floats, Floats]:
     """Given bounds, else what was seen and a margin, within what is declared."""
     assert isinstance(env.observation_space, spaces.Dict)

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 from gymnasium.utils import RecordConstructorArgs
 
+from sb3_tbc.aliases import Env, Wrapper
 
-class GoalAccess(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+
+class GoalAccess(Wrapper, RecordConstructorArgs):
     """Shows the attributes of the environments below, such as ``compute_reward`` and ``subgoals``, as its own.
 
     Gymnasium's wrappers no longer do that, but SB3's ``check_env`` and older code ask ``env.compute_reward``.
     """
 
-    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+    def __init__(self, env: Env) -> None:
         RecordConstructorArgs.__init__(self)
         super().__init__(env)
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
+from sb3_tbc.aliases import Env
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, goal_space_problems
 
 from .probe import Floats, Probe, run_probe
@@ -16,7 +15,7 @@ from .success_test import compute_reward_of
 from .time_limit import time_limit
 
 
-def goal_env_problems(env: gym.Env[Any, Any], n_steps: int = 20) -> list[str]:
+def goal_env_problems(env: Env, n_steps: int = 20) -> list[str]:
     """What keeps a hierarchical agent from acting in an environment, each with a cure; empty if nothing.
 
     :param env: any environment; it is reset and stepped ``n_steps`` times
@@ -32,7 +31,7 @@ def goal_env_problems(env: gym.Env[Any, Any], n_steps: int = 20) -> list[str]:
     return problems or reward_problems(env, run_probe(env, n_steps))
 
 
-def check_goal_env(env: gym.Env[Any, Any]) -> None:
+def check_goal_env(env: Env) -> None:
     """Explain what an environment lacks for hierarchical, goal-conditioned learning.
 
     Warns if two runs from one seed differ: then randomness comes from elsewhere than ``np_random``, and no run can be
@@ -52,12 +51,12 @@ def check_goal_env(env: gym.Env[Any, Any]) -> None:
         )
 
 
-def name_of(env: gym.Env[Any, Any]) -> str:
+def name_of(env: Env) -> str:
     """Id of an environment, or the name of its class."""
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
 
 
-def repeats(env: gym.Env[Any, Any], n_steps: int = 10) -> bool:
+def repeats(env: Env, n_steps: int = 10) -> bool:
     """Whether the same seed and actions lead to the same observations and rewards, to about six digits."""
     one, other = run_probe(env, n_steps), run_probe(env, n_steps)
     if any(one.seen[key].shape != other.seen[key].shape for key in GOAL_KEYS):
@@ -66,7 +65,7 @@ def repeats(env: gym.Env[Any, Any], n_steps: int = 10) -> bool:
     return all(np.allclose(a, b, rtol=1e-5, atol=1e-5, equal_nan=True) for a, b in pairs)
 
 
-def reward_problems(env: gym.Env[Any, Any], probe: Probe) -> list[str]:
+def reward_problems(env: Env, probe: Probe) -> list[str]:
     """Whether rewards can be recomputed without a step's info, singly and in batches, for relabelled goals too.
 
     :param probe: what random episodes in the environment showed

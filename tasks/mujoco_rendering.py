@@ -135,7 +135,7 @@ class Scene:
             geom.rgba[:] = (0.0, 0.0, 0.0, 0.0) if geom.objid in without else rgba
             geom.matid = -1
 
-    def add_geom(self, kind: Any, size: ArrayLike, position: ArrayLike, rgba: Sequence[float]) -> None:
+    def add_geom(self, kind: mujoco.mjtGeom, size: ArrayLike, position: ArrayLike, rgba: Sequence[float]) -> None:
         """Add a free-standing shape (a ``mujoco.mjtGeom``) of half-sizes ``size``."""
         geom = self._next_geom()
         mujoco.mjv_initGeom(

@@ -5,19 +5,21 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from typing import SupportsFloat
 
-import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from sb3_tbc.aliases import Plain, Wrapper
+from sb3_tbc.arrays import AnyArray
 
 from .base import GoalTask
 
 Scale = float | Sequence[float]
 
 
-class Perturb(gym.Wrapper[Any, Any, Any, Any]):
+class Perturb(Wrapper):
     """Disturbs a task, reproducibly from the seed given to ``reset``; ``gym.make(id, perturb={...})`` adds it.
 
     Rewards, success and ``achieved_goal`` always are those of the true state.
@@ -63,7 +65,7 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
             frames = range(0, len(env.observation_scale), env.frame_dim)
             self._hidden = [first + entry for first in frames for entry in env.velocity_entries]
         self._rng: np.random.Generator = np.random.default_rng()
-        self._pending: deque[NDArray[Any]] = deque()
+        self._pending: deque[AnyArray] = deque()
         self._noise_stack: NDArray[np.float64] = np.zeros(len(env.observation_scale))
 
     @property
@@ -72,8 +74,8 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
         return self.env.spec
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, NDArray[np.float64]], dict[str, Any]]:
+        self, *, seed: int | None = None, options: Plain | None = None
+    ) -> tuple[dict[str, NDArray[np.float64]], Plain]:
         """Start an episode; draws this episode's physics first."""
         if seed is not None:
             self._rng = np.random.default_rng([seed, 1])  # apart from the task's own stream
@@ -84,7 +86,7 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
         observation, info = self.env.reset(seed=seed, options=options)
         return self._noisy(observation, first=True), info
 
-    def step(self, action: Any) -> tuple[dict[str, NDArray[np.float64]], Any, bool, bool, dict[str, Any]]:
+    def step(self, action: ArrayLike) -> tuple[dict[str, NDArray[np.float64]], SupportsFloat, bool, bool, Plain]:
         """Step with the action of ``action_delay`` steps ago."""
         if self._delay:
             self._task.check_action(action)
@@ -95,7 +97,7 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
         observation, *rest = self.env.step(action)
         return self._noisy(observation, first=False), *rest  # type: ignore[return-value]
 
-    def _noisy(self, observation: dict[str, Any], first: bool) -> dict[str, Any]:
+    def _noisy(self, observation: Plain, first: bool) -> Plain:
         if self._noise:
             stack, frame = self._noise_stack, self._task.frame_dim
             fresh = self._rng.normal(0.0, self._noise, frame) * self._task.observation_scale[-frame:]
@@ -106,7 +108,7 @@ class Perturb(gym.Wrapper[Any, Any, Any, Any]):
         return observation
 
 
-def _number(name: str, value: Any, low: float, high: float) -> float:
+def _number(name: str, value: object, low: float, high: float) -> float:
     if not isinstance(value, (int, float)) or not low <= value < np.inf or not value <= high:
         raise ValueError(f"{name} must be a number from {low} to {high}, got {value!r}")
     return float(value)

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
@@ -54,7 +55,7 @@ class Platforms(ReplayedTask):
     times too large; a reset leaves platforms (in a fresh environment at the origin) and contact impulses as they were.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 60}
+    metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 60}
     _not_copied: ClassVar[tuple[str, ...]] = (
         *ReplayedTask._not_copied, "_world", "_platform0", "_platform1", "_ball",
     )  # fmt: skip

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Env, Plain
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+from sb3_tbc.smdp.spaces import GoalObservation
 
 Floats = NDArray[np.float64]
 
@@ -36,7 +37,7 @@ class Probe(NamedTuple):
         return self.seen["desired_goal"][self.after]
 
 
-def run_probe(env: gym.Env[Any, Any], n_steps: int, seed: int = 0, episode_steps: int = 50) -> Probe:
+def run_probe(env: Env, n_steps: int, seed: int = 0, episode_steps: int = 50) -> Probe:
     """Run random actions, each held for five steps, in short episodes.
 
     The environment's own random stream is put back afterwards. The last episode is left unfinished, so that the
@@ -69,18 +70,18 @@ def run_probe(env: gym.Env[Any, Any], n_steps: int, seed: int = 0, episode_steps
     return Probe(stacked, np.array(after), np.array(rewards), np.array(terminations), successes)
 
 
-def said_success(info: dict[str, Any]) -> bool | None:
+def said_success(info: Plain) -> bool | None:
     """Success of a step as its ``info`` says it, under ``is_success`` or ``success``; None where it says nothing."""
     said = info.get("is_success", info.get("success"))
     return None if said is None else bool(np.all(said))
 
 
-def _copied(observation: Any) -> dict[str, Floats]:
+def _copied(observation: GoalObservation) -> dict[str, Floats]:
     return {key: np.array(observation[key], dtype=np.float64) for key in GOAL_KEYS}
 
 
 @contextmanager
-def _random_stream_kept(env: gym.Env[Any, Any]) -> Iterator[None]:
+def _random_stream_kept(env: Env) -> Iterator[None]:
     inner = env.unwrapped
     generator, seed = inner._np_random, inner._np_random_seed
     try:

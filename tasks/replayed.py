@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from array import array
-from typing import Any, ClassVar, NamedTuple
+from types import ModuleType
+from typing import ClassVar, NamedTuple
 
 from .base import GoalTask
 
@@ -39,7 +40,7 @@ class ReplayedTask(GoalTask):
         """Advance the world by one control step; ``self._elapsed`` steps were made before it."""
 
     @abstractmethod
-    def _load_engine(self) -> Any:
+    def _load_engine(self) -> ModuleType:
         """Import the engine's module."""
 
     def _new_world(self) -> None:

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
@@ -48,7 +49,7 @@ class Tennis2D(ReplayedTask):
     ``gymnasium.make`` only with ``max_episode_steps=501``).
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
+    metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 50}
     _not_copied: ClassVar[tuple[str, ...]] = (*ReplayedTask._not_copied, "_arena")
     dynamics_names = ("mass", "damping", "gravity", "actuator")
     max_episode_steps = 500

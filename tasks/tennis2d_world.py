@@ -118,7 +118,7 @@ class TennisWorld:
         self.world.Step(dt, 10, 8)
         self.world.ClearForces()
 
-    def touched(self, one: Any, other: Any) -> None:
+    def touched(self, one: object, other: object) -> None:
         """Note a contact that began in this step."""
         pair = (one, other)
         if self.ball not in pair:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 from gymnasium.wrappers import TimeLimit
 
+from sb3_tbc.aliases import Env
 
-def time_limit(env: gym.Env[Any, Any]) -> int | None:
+
+def time_limit(env: Env) -> int | None:
     """Environment steps after which an episode is truncated: the smallest limit that anything in ``env`` sets.
 
     Limits are set by ``TimeLimit`` wrappers (``gymnasium.make`` adds one), and by environments with an attribute
@@ -30,8 +30,8 @@ def time_limit(env: gym.Env[Any, Any]) -> int | None:
     return int(min(declared)) if declared else getattr(env.spec, "max_episode_steps", None)
 
 
-def declared_limit(spec: Any, own: Any, truncates_itself: Any) -> int | None:
-    """The same where only attributes can be asked for, because the environment lives in another process.
+def declared_limit(spec: object, own: int | None, truncates_itself: bool) -> int | None:
+    """As :func:`time_limit`, for an environment in another process, of which only attributes can be asked for.
 
     :param spec: its ``spec``; None where it has none
     :param own: its ``max_episode_steps``; None where it has none

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import mujoco
 import numpy as np
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .base import Array
@@ -142,7 +143,7 @@ class UR5Reacher(MujocoTask):
     xml: ClassVar[str] = MODEL
     drawn_xml: ClassVar[str | None] = DRAWN_MODEL
     frame_skip: ClassVar[int] = 15
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array", "human"], "render_fps": 33}
+    metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 33}
     max_episode_steps = 600
     action_bound = (3.15, 5.0, 3.15)
     goal_low = (-2 * math.pi,) * 3

@@ -9,11 +9,12 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
 from .base import Array
@@ -27,7 +28,11 @@ SERVO_GAIN = 10.0
 DAMPING = 10.0
 MAX_TORQUE = 150.0
 MAX_COMMAND = (3.15, 5.0, 3.15)
-URDF_LINKS = (  # name, mass, centre of mass, diagonal inertia, shapes: (urdf geometry, xyz, rpy)
+Shape = tuple[str, float, float | None, str, str]
+"""Kind, radius, length (None for a sphere), place and rotation of a collision shape."""
+URDF_LINKS: tuple[
+    tuple[str, float, str, tuple[float, float, float], list[Shape]], ...
+] = (  # name, mass, centre of mass, diagonal inertia, shapes
     ("base_link", 4.0, "0 0 0", (0.00443333, 0.00443333, 0.0072), [("cylinder", 0.0735, 0.024, "0 0 0.009", "0 0 0")]),
     (
         "shoulder_link",
@@ -68,7 +73,7 @@ class UR5ReacherBullet(ReplayedTask):
     :raises ImportError: without PyBullet, naming the extra that installs it
     """
 
-    metadata: ClassVar[dict[str, Any]] = UR5Reacher.metadata
+    metadata: ClassVar[Plain] = UR5Reacher.metadata
     _not_copied: ClassVar[tuple[str, ...]] = (*ReplayedTask._not_copied, "_client", "_twin")
     max_episode_steps = UR5Reacher.max_episode_steps
     action_bound = UR5Reacher.action_bound
@@ -264,7 +269,7 @@ def urdf() -> str:
     return f'<robot name="ur5">{links}{joints}</robot>'
 
 
-def _link(name: str, mass: float, com: str, inertia: tuple[float, ...], shapes: list[tuple[Any, ...]]) -> str:
+def _link(name: str, mass: float, com: str, inertia: tuple[float, ...], shapes: list[Shape]) -> str:
     ixx, iyy, izz = inertia
     collisions = "".join(
         f'<collision><origin xyz="{xyz}" rpy="{rpy}"/><geometry>{_geometry(kind, size, length)}</geometry></collision>'

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch as th
 
@@ -82,7 +82,7 @@ def command(argv: Sequence[str]) -> int:
     return 0
 
 
-def _write(args: Any, found: Findings, model: TBCHRL, info: Plain, episodes: HeldOutEpisodes) -> None:
+def _write(args: argparse.Namespace, found: Findings, model: TBCHRL, info: Plain, episodes: HeldOutEpisodes) -> None:
     """Write the files that were asked for."""
     space, subgoals = space_of(info["task"], model.views.subgoals), model.views.subgoals
     identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import expit
@@ -17,11 +17,14 @@ from sb3_tbc.interpret.names import action_names, input_names
 from sb3_tbc.interpret.units import CircuitUnits
 from sb3_tbc.tbc_hrl import TBCHRL
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 MAX_STEPS = 500
 """Steps whose currents are averaged."""
 
 
-def draw_agent(model: TBCHRL, task: str, units: CircuitUnits, traces: Sequence[Trace], ax: Any = None) -> Any:
+def draw_agent(model: TBCHRL, task: str, units: CircuitUnits, traces: Sequence[Trace], ax: Axes | None = None) -> Axes:
     """Draw the circuit with the task's names; synapses are as thick as the mean size of their currents in episodes.
 
     :param model: the agent

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.interpret.correlation import Correlation, correlate
 from sb3_tbc.interpret.episodes import HeldOutEpisodes, Trace, outcome_of
 from sb3_tbc.interpret.features import TaskSpace, features_of
@@ -56,7 +58,7 @@ class Findings(NamedTuple):
     features: tuple[str, ...]
     success: float
     subgoals: float
-    activity: Any  # (N,)
+    activity: FloatArray  # (N,)
     correlation: Correlation
     information: PhaseInformation | None
     time_constants: TimeConstants | None
@@ -164,8 +166,9 @@ def _lesion(result: LesionResult) -> Plain:
     return plain
 
 
-def _rounded(values: Any) -> Any:
-    return np.round(np.asarray(values, dtype=np.float64), 5).tolist()
+def _rounded(values: ArrayLike) -> list[float]:
+    rounded: list[float] = np.round(np.asarray(values, dtype=np.float64), 5).tolist()
+    return rounded
 
 
 def summary(found: Findings) -> dict[str, float | None]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.export.policy import MLP, ExportedPolicy, extract
 from sb3_tbc.interpret.episodes import HeldOutEpisodes, Trace
 from sb3_tbc.interpret.features import TaskSpace, places_of
@@ -158,7 +159,7 @@ def _how(found: Findings, live: bool) -> str:
     return f"{memory} The circuit is computed in this page, from the inputs that it had in the recorded episodes."
 
 
-def _readout(policy: ExportedPolicy, n_units: int) -> Any:
+def _readout(policy: ExportedPolicy, n_units: int) -> FloatArray:
     if not isinstance(policy.low, MLP):
         return policy.low.readout
     readout = np.zeros((n_units, policy.low.weights[-1].shape[1]))
@@ -174,7 +175,7 @@ def _bounds(traces: Sequence[Trace], space: TaskSpace, model: TBCHRL) -> list[fl
     return [float(x) for x in (*(low - margin), *(high + margin))]
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> Any:
     if isinstance(value, Mapping):
         return {name: _plain(part) for name, part in value.items()}
     if isinstance(value, np.ndarray):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import FloatArray, FloatType
 from sb3_tbc.level.policies import GaussianHead, LevelPolicy, MLPActor, NDBCActor
 from sb3_tbc.level.storage import Block
 
@@ -27,7 +27,7 @@ def _elu(x: FloatArray) -> FloatArray:
     return np.where(x > 0, x, np.expm1(np.minimum(x, 0)))
 
 
-ACTIVATIONS: dict[type[nn.Module], Callable[[Any], Any]] = {
+ACTIVATIONS: dict[type[nn.Module], Callable[[FloatArray], FloatArray]] = {
     nn.ReLU: _relu,
     nn.Tanh: np.tanh,
     nn.SiLU: _silu,
@@ -55,7 +55,7 @@ class FrozenMLP:
     :raises ValueError: for an activation function without a NumPy counterpart
     """
 
-    def __init__(self, actor: MLPActor, dtype: type[np.floating[Any]] = np.float32) -> None:
+    def __init__(self, actor: MLPActor, dtype: FloatType = np.float32) -> None:
         if actor.activation_fn not in ACTIVATIONS:
             allowed = sorted(f.__name__ for f in ACTIVATIONS)
             raise ValueError(f"activation_fn must be one of {allowed} to act in NumPy, got {actor.activation_fn}")
@@ -93,7 +93,7 @@ def _as_array(block: Block) -> FloatArray:
     return first.as_strided(block.shape, strides).numpy()
 
 
-def freeze(actor: MLPActor | NDBCActor, dtype: type[np.floating[Any]] = np.float32) -> FrozenNet:
+def freeze(actor: MLPActor | NDBCActor, dtype: FloatType = np.float32) -> FrozenNet:
     """NumPy forward pass of an actor whose parameters lie in flat storage.
 
     :param dtype: precision of an MLP's arithmetic; a circuit's is double in any case

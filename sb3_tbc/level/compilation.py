@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import torch as th
 from torch import fx
@@ -106,7 +105,7 @@ def split_bias_from_products(graph: fx.GraphModule) -> None:
 
 def merge_repeated(graph: fx.GraphModule) -> None:
     """Compute once what is computed twice between two changes in place (the circuit's conductances, for example)."""
-    seen: dict[Any, fx.Node] = {}
+    seen: dict[object, fx.Node] = {}
     for node in list(graph.graph.nodes):
         if node.op != "call_function":
             continue

@@ -16,7 +16,8 @@ from gymnasium import spaces
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, Actor, SACPolicy
 from torch import nn
 from torch.nn import functional
@@ -193,17 +194,17 @@ class NDBCActor(BasePolicy):
         mean, log_std, _ = self.step(features, self.net.initial_state(len(features)))
         return mean, log_std, {}
 
-    def forward(self, obs: Any, deterministic: bool = False) -> th.Tensor:
+    def forward(self, obs: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """Squashed action from a circuit at rest."""
         mean, log_std, _ = self.get_action_dist_params(obs)
         return self.action_dist.actions_from_params(mean, log_std, deterministic=deterministic)
 
-    def action_log_prob(self, obs: Any) -> tuple[th.Tensor, th.Tensor]:
+    def action_log_prob(self, obs: PyTorchObs) -> tuple[th.Tensor, th.Tensor]:
         """Sampled action and its log-probability from a circuit at rest."""
         mean, log_std, _ = self.get_action_dist_params(obs)
         return self.action_dist.log_prob_from_params(mean, log_std)
 
-    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self.forward(observation, deterministic)
 
 
@@ -262,7 +263,7 @@ class LevelPolicy(SACPolicy):
     def _get_constructor_parameters(self) -> Plain:
         return {**super()._get_constructor_parameters(), **self.level_kwargs}
 
-    def load_state_dict(self, *args: Any, **kwargs: Any) -> Any:
+    def load_state_dict(self, *args: Any, **kwargs: Any) -> object:
         """Load weights in place, see torch."""
         result = super().load_state_dict(*args, **kwargs)
         self._weights_changed()
@@ -279,7 +280,7 @@ class LevelPolicy(SACPolicy):
             self.average_actor.net.sub_steps = self.actor.net.sub_steps
         self.weights_version += 1
 
-    def make_actor(self, features_extractor: Any = None) -> MLPActor | NDBCActor:  # type: ignore[override]
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> MLPActor | NDBCActor:  # type: ignore[override]
         """Build the actor that ``ndbc`` asks for."""
         kwargs = self._update_features_extractor(self.actor_kwargs, features_extractor)
         bounds = {key: self.level_kwargs[key] for key in ("mean_bound", "log_std_bounds")}
@@ -289,7 +290,7 @@ class LevelPolicy(SACPolicy):
         shared = ("observation_space", "action_space", "features_extractor", "features_dim", "normalize_images")
         return NDBCActor(ndbc=ndbc, **bounds, **{key: kwargs[key] for key in shared}).to(self.device)
 
-    def make_critic(self, features_extractor: Any = None) -> LevelCritic:
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> LevelCritic:
         """Build the critics."""
         kwargs = self._update_features_extractor(self.critic_kwargs, features_extractor)
         negative, norm = self.level_kwargs["negative_critic"], self.level_kwargs["critic_norm"]

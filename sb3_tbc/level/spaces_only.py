@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 from sb3_tbc.aliases import Space
 from sb3_tbc.errors import HierarchyError
@@ -20,15 +20,15 @@ class SpacesOnlyVecEnv(VecEnv):
     def _refuse(self) -> HierarchyError:
         return HierarchyError("a level has no environment of its own; call learn on the model that owns the level")
 
-    def reset(self) -> Any:
+    def reset(self) -> VecEnvObs:
         """A level's environment cannot be reset."""
         raise self._refuse()
 
-    def step_async(self, actions: Any) -> None:
+    def step_async(self, actions: object) -> None:
         """A level's environment cannot be stepped."""
         raise self._refuse()
 
-    def step_wait(self) -> Any:
+    def step_wait(self) -> VecEnvStepReturn:
         """A level's environment cannot be stepped."""
         raise self._refuse()
 
@@ -39,20 +39,20 @@ class SpacesOnlyVecEnv(VecEnv):
         """Nothing to seed."""
         return [None]
 
-    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: object = None) -> list[None]:
         """Attributes of the environment: it can only say that it does not render."""
         if attr_name == "render_mode":
             return [None]
         raise AttributeError(f"a level has no environment and thus no attribute {attr_name!r}")
 
-    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: object = None) -> None:
         """A level's environment has no attributes."""
         raise self._refuse()
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: object, indices: object = None, **kwargs: object) -> list[None]:
         """A level's environment has no methods."""
         raise self._refuse()
 
-    def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
+    def env_is_wrapped(self, wrapper_class: type, indices: object = None) -> list[bool]:
         """Not wrapped."""
         return [False]

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch as th
 
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import FloatArray, FloatType
 from sb3_tbc.ndbc.cell import ConductanceCell
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class ClosedFormNDBC:
     :raises ValueError: for dissipative dynamics
     """
 
-    def __init__(self, net: NDBCNet, dtype: type[np.floating[Any]] = np.float32) -> None:
+    def __init__(self, net: NDBCNet, dtype: FloatType = np.float32) -> None:
         if not isinstance(net.cell, ConductanceCell):
             raise ValueError("only conductance dynamics have the closed form; this network is dissipative")
         self.net, self.cell, self.dtype = net, net.cell, dtype

@@ -7,13 +7,17 @@ currents of a trained agent, synapses are as thick and as dark as they are used.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import BoolArray, FloatArray
 from sb3_tbc.extras import require
 from sb3_tbc.ndbc.wiring import LAYERS, NDBCWiring
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 COLOURS = {"sensory": "#4d9221", "inter": "#7b7b7b", "command": "#c27ba0", "motor": "#e08214"}
 EXCITATORY, INHIBITORY = "#c0392b", "#2c5aa0"
@@ -22,13 +26,13 @@ OUTPUT, DEAD = "#444444", "#999999"
 
 def draw_wiring(
     wiring: NDBCWiring,
-    ax: Any = None,
+    ax: Axes | None = None,
     input_names: Sequence[str] | None = None,
     *,
     readout: FloatArray | None = None,
     output_names: Sequence[str] | None = None,
     used: tuple[FloatArray, FloatArray] | None = None,
-) -> Any:
+) -> Axes:
     """Draw neurons, signed synapses and, where they are known, the readout's weights and how much each synapse is used.
 
     :param wiring: the wiring
@@ -97,7 +101,9 @@ def _shares(weights: FloatArray) -> FloatArray:
     return np.asarray(size / max(float(size.max(initial=0.0)), 1e-12))
 
 
-def _draw_neurons(ax: Any, wiring: NDBCWiring, places: Any, dead: tuple[BoolArray, BoolArray], n_outputs: int) -> None:
+def _draw_neurons(
+    ax: Axes, wiring: NDBCWiring, places: FloatArray, dead: tuple[BoolArray, BoolArray], n_outputs: int
+) -> None:
     sizes = {"sensory": wiring.n_inputs, **{name: getattr(wiring, name) for name in LAYERS}}
     sizes.update({"output": n_outputs} if n_outputs else {})
     ended, start = np.concatenate([*dead, np.zeros(n_outputs, dtype=bool)]), 0
@@ -105,7 +111,7 @@ def _draw_neurons(ax: Any, wiring: NDBCWiring, places: Any, dead: tuple[BoolArra
         colour, part = COLOURS.get(name, OUTPUT), slice(start, start + size)
         for which, filled in ((~ended[part], True), (ended[part], False)):
             x, y = places[part][which].T
-            look = {"color": colour, "edgecolor": "white"} if filled else {"color": "white", "edgecolor": DEAD}
+            look: Plain = {"color": colour, "edgecolor": "white"} if filled else {"color": "white", "edgecolor": DEAD}
             ax.scatter(x, y, s=110, linewidth=1.0, linestyle="-" if filled else "--", zorder=3, **look)
         ax.text(column, 1.08, f"{name} ({size})", ha="center", va="bottom", fontsize=9, color=colour)
         start += size
@@ -113,18 +119,19 @@ def _draw_neurons(ax: Any, wiring: NDBCWiring, places: Any, dead: tuple[BoolArra
         ax.text(1.5, -0.06, f"hollow: {int(ended.sum())} dead ends, which act on no output", ha="center", fontsize=7)
 
 
-def _places(wiring: NDBCWiring, n_outputs: int) -> Any:
+def _places(wiring: NDBCWiring, n_outputs: int) -> FloatArray:
     """Coordinates of all neurons, sensory ones first, then of the outputs: one column per layer, evenly spread."""
     sizes = (wiring.n_inputs, wiring.inter, wiring.command, wiring.motor, n_outputs)
     columns = [np.stack([np.full(n, c), 1.0 - (np.arange(n) + 0.5) / n], axis=1) for c, n in enumerate(sizes) if n]
     return np.concatenate(columns)
 
 
-def _synapse(ax: Any, source: Any, target: Any, excites: bool, share: float) -> None:
+def _synapse(ax: Axes, source: FloatArray, target: FloatArray, excites: bool, share: float) -> None:
     """A line between layers, an arc, bending to the right, within one; ``share`` of the thickest, 0 to 1."""
     bend = 0.0 if source[0] != target[0] else 0.6 * np.sign(source[1] - target[1] or 1.0)
     style = {
         "arrowstyle": "-|>", "color": EXCITATORY if excites else INHIBITORY, "alpha": 0.08 + 0.85 * share,
         "lw": 0.3 + 1.1 * share, "shrinkA": 5, "shrinkB": 6,
     }  # fmt: skip
-    ax.annotate("", target, source, arrowprops={**style, "connectionstyle": f"arc3,rad={bend}", "mutation_scale": 6})
+    ends = (target[0], target[1]), (source[0], source[1])
+    ax.annotate("", *ends, arrowprops={**style, "connectionstyle": f"arc3,rad={bend}", "mutation_scale": 6})

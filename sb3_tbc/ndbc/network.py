@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from numbers import Integral
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch as th
 from torch import nn
 from torch.nn import functional
 
-from sb3_tbc.aliases import PlainMapping
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.ndbc.cell import Cell, ConductanceCell
 from sb3_tbc.ndbc.dissipative import Certificate, DissipativeCell
@@ -19,6 +19,9 @@ from sb3_tbc.ndbc.lean import LeanCell
 from sb3_tbc.ndbc.sequence import Unrolled, unroll
 from sb3_tbc.ndbc.stepping import LipschitzProxy, StepRule, advance_checked
 from sb3_tbc.ndbc.wiring import NDBCWiring
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 DYNAMICS = ("conductance", "dissipative")
 SYNAPSES = ("paper", "lean")
@@ -237,14 +240,14 @@ class NDBCNet(nn.Module):
             if value is not None and tuple(value.shape) != lead:
                 raise ValueError(f"{name} must have one entry per step, shape {lead}, got {tuple(value.shape)}")
 
-    def _save_to_state_dict(self, destination: Any, prefix: str, keep_vars: bool) -> None:
+    def _save_to_state_dict(self, destination: Plain, prefix: str, keep_vars: bool) -> None:
         """With a step-size rule, also K, the updates since it was chosen, and where the power iteration stands."""
         super()._save_to_state_dict(destination, prefix, keep_vars)
         if self.step_rule is not None:
             destination[prefix + STEP_STATE] = th.tensor([self.sub_steps, self.updates])
             destination[prefix + STEP_DIRECTION] = self.lipschitz.direction.clone()
 
-    def _load_from_state_dict(self, state_dict: Any, prefix: str, *args: Any) -> None:
+    def _load_from_state_dict(self, state_dict: Plain, prefix: str, *args: object) -> None:
         """Take over weights and K.
 
         The index tables of the cell are part of the state, so weights of another wiring are recognised and refused:
@@ -261,7 +264,7 @@ class NDBCNet(nn.Module):
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._restore_step = None if chosen is None else (chosen.tolist(), direction)
 
-    def draw(self, ax: Any = None, input_names: Sequence[str] | None = None, **more: Any) -> Any:
+    def draw(self, ax: Axes | None = None, input_names: Sequence[str] | None = None, **more: object) -> Axes:
         """Draw neurons, the readout's weights, and synapses with their present polarities.
 
         :param ax: matplotlib axes to draw into; new ones by default
@@ -330,7 +333,7 @@ class NDBCNet(nn.Module):
         return self.cell.certificate(1.0 / self.sub_steps)
 
 
-def _after_loading(net: NDBCNet, _: Any) -> None:
+def _after_loading(net: NDBCNet, _: object) -> None:
     """Once all weights are there: K and its companions as they were saved."""
     if net.step_rule is None:
         return

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.aliases import Plain, PlainMapping
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SignMatrix = NDArray[np.int8]
 """Synapses as a matrix ``[presynaptic, postsynaptic]``: +1 excitatory, -1 inhibitory, 0 none."""
@@ -40,7 +43,7 @@ class NDBCWiring:
     :raises ValueError: if a size is not a positive integer, a fan is negative or ``sensory_to`` is something else
     """
 
-    drawer: ClassVar[Callable[..., Any] | None] = None
+    drawer: ClassVar[Callable[..., Axes] | None] = None
     """What :meth:`draw` calls; set where the package is put together, since drawing builds upon wirings."""
 
     def __init__(
@@ -228,7 +231,7 @@ class NDBCWiring:
         drawn.recurrent = np.sign(np.asarray(wiring.adjacency_matrix)[np.ix_(order, order)]).astype(np.int8)
         return drawn
 
-    def draw(self, ax: Any = None, input_names: Sequence[str] | None = None, **more: Any) -> Any:
+    def draw(self, ax: Axes | None = None, input_names: Sequence[str] | None = None, **more: object) -> Axes:
         """Draw neurons and synapses with matplotlib; see :func:`sb3_tbc.ndbc.drawing.draw_wiring`.
 
         :param ax: matplotlib axes to draw into; new ones by default

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch as th
@@ -59,7 +58,7 @@ class RingBuffer(BaseBuffer):
         """Number of rows stored."""
         return self.buffer_size if self.full else self.pos
 
-    def add(self, *args: Any, **kwargs: Any) -> None:
+    def add(self, *args: object, **kwargs: object) -> None:
         """Refused: rows come in whole episodes.
 
         :raises TypeError: always, naming the method to use

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence, Sized
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
+
+Value = TypeVar("Value", contravariant=True)
 
 
-class Domain(Protocol):
+class Domain(Protocol[Value]):
     """A condition that a value of the right type must meet as well."""
 
-    def holds(self, value: Any) -> bool:
+    def holds(self, value: Value) -> bool:
         """Whether the value is allowed."""
 
     def __str__(self) -> str:
@@ -35,7 +38,7 @@ class Range:
     below: bool = False
     also: tuple[float, ...] = ()
 
-    def holds(self, value: Any) -> bool:
+    def holds(self, value: float) -> bool:
         """Whether a number lies within the bounds."""
         low = value > self.low if self.above else value >= self.low
         high = value < self.high if self.below else value <= self.high
@@ -69,7 +72,7 @@ class Prefixed:
     prefix: str
     number: Range
 
-    def holds(self, value: Any) -> bool:
+    def holds(self, value: object) -> bool:
         """Whether a text has this form."""
         try:
             number = float(str(value).removeprefix(self.prefix))
@@ -85,7 +88,7 @@ class Prefixed:
 class Increasing:
     """Numbers in rising order, each larger than the one before it."""
 
-    def holds(self, value: Any) -> bool:
+    def holds(self, value: Sequence[float]) -> bool:
         """Whether a sequence rises."""
         return all(a < b for a, b in itertools.pairwise(value))
 
@@ -97,7 +100,7 @@ class Increasing:
 class NotEmpty:
     """Lists of at least one entry."""
 
-    def holds(self, value: Any) -> bool:
+    def holds(self, value: Sized) -> bool:
         """Whether a sequence has entries."""
         return len(value) > 0
 

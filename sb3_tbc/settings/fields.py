@@ -13,7 +13,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
-from sb3_tbc.settings.kinds import allows_none, arms, default_of, hints, section_of, split
+from sb3_tbc.settings.kinds import Section, allows_anything, allows_none, arms, default_of, hints, section_of, split
 from sb3_tbc.settings.texts import describe, remark, section_text
 
 SelfSettings = TypeVar("SelfSettings", bound="Settings")
@@ -70,7 +70,7 @@ class Settings:
         return result
 
 
-def plain(value: Any) -> Any:
+def plain(value: object) -> Any:
     """Plain data of a value: settings become dictionaries, tuples become lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
@@ -84,7 +84,7 @@ def plain(value: Any) -> Any:
 # ------------------------------------------------------------------------------------------------- checking
 
 
-def read(value: Any, hint: Any, name: str, default: Any = None, partial: bool = False) -> Any:
+def read(value: object, hint: object, name: str, default: object = None, partial: bool = False) -> object:
     """Check a value and convert it to its type: whole floats to integers, lists to tuples, mappings to settings.
 
     :param value: what was given
@@ -100,7 +100,7 @@ def read(value: Any, hint: Any, name: str, default: Any = None, partial: bool = 
     if get_origin(kind) in (typing.Union, types.UnionType):
         result = _read_union(value, kind, name, default, partial)
     elif dataclasses.is_dataclass(kind):
-        result = _read_section(value, typing.cast(type[Any], kind), name, default, partial)
+        result = _read_section(value, typing.cast(Section, kind), name, default, partial)
     else:
         result = _read_plain(value, kind, name)
     if result is _WRONG or not all(domain.holds(result) for domain in domains):
@@ -108,7 +108,7 @@ def read(value: Any, hint: Any, name: str, default: Any = None, partial: bool = 
     return result
 
 
-def read_partial(given: Any, kinds: PlainMapping, where: str = "") -> Plain:
+def read_partial(given: object, kinds: PlainMapping, where: str = "") -> Plain:
     """Check some settings without adding the others.
 
     :param given: values by name
@@ -117,26 +117,28 @@ def read_partial(given: Any, kinds: PlainMapping, where: str = "") -> Plain:
     :return: the same values, numbers converted to their types
     :raises SettingError: on an unknown name or a value that is not allowed
     """
-    _check_names(given, kinds, where)
-    return {name: plain(read(value, kinds[name], _dotted(where, name), partial=True)) for name, value in given.items()}
+    known = _checked_names(given, kinds, where)
+    return {name: plain(read(value, kinds[name], _dotted(where, name), partial=True)) for name, value in known.items()}
 
 
-def _check_names(given: Any, kinds: PlainMapping, where: str) -> None:
+def _checked_names(given: object, kinds: PlainMapping, where: str) -> PlainMapping:
     if not isinstance(given, Mapping):
         raise SettingError(where, f"must be {section_text(kinds)}, got {given!r}")
     for name in given:
         if name not in kinds:
             raise SettingError("", f"unknown setting {_dotted(where, str(name))!r}; {nearest(str(name), kinds)}")
+    return given
 
 
-def _read_section(value: Any, kind: type[Any], name: str, default: Any, partial: bool) -> Any:
+def _read_section(value: object, kind: Section, name: str, default: object, partial: bool) -> object:
     if isinstance(value, kind):
         return value
     if partial:
         return read_partial(value, hints(kind), name)
-    _check_names(value, hints(kind), name)
+    kinds = hints(kind)
+    given = _checked_names(value, kinds, name)
     base = default if isinstance(default, kind) else kind()
-    changes = {key: read(item, hints(kind)[key], _dotted(name, key), getattr(base, key)) for key, item in value.items()}
+    changes = {key: read(item, kinds[key], _dotted(name, key), getattr(base, key)) for key, item in given.items()}
     try:
         return dataclasses.replace(base, **changes)
     except SettingError as error:
@@ -145,12 +147,12 @@ def _read_section(value: Any, kind: type[Any], name: str, default: Any, partial:
         raise SettingError(name, f"is not possible: {error}") from None
 
 
-def _read_union(value: Any, kind: Any, name: str, default: Any, partial: bool) -> Any:
+def _read_union(value: object, kind: object, name: str, default: object, partial: bool) -> object:
     section = section_of(kind)
     if section is not None and isinstance(value, Mapping):
         return _read_section(value, section, name, default, partial)
     for arm in arms(kind):
-        if not dataclasses.is_dataclass(arm) or isinstance(value, typing.cast(type[Any], arm)):
+        if not dataclasses.is_dataclass(arm) or isinstance(value, typing.cast(Section, arm)):
             try:
                 return read(value, arm, name, _WRONG, partial) if value is not None else None
             except SettingError:
@@ -158,9 +160,9 @@ def _read_union(value: Any, kind: Any, name: str, default: Any, partial: bool) -
     return _WRONG
 
 
-def _read_plain(value: Any, kind: Any, name: str) -> Any:
+def _read_plain(value: object, kind: object, name: str) -> object:
     origin = get_origin(kind)
-    if kind is Any:
+    if allows_anything(kind):
         return value
     if origin is Literal:
         return next((choice for choice in get_args(kind) if type(choice) is type(value) and choice == value), _WRONG)
@@ -170,23 +172,23 @@ def _read_plain(value: Any, kind: Any, name: str) -> Any:
         return _read_dict(value, get_args(kind)[1], name)
     if origin is type:
         return value if isinstance(value, type) and issubclass(value, get_args(kind)) else _WRONG
-    if kind in (int, float):
-        return _read_number(value, kind)
-    return value if isinstance(value, kind) else _WRONG
+    if kind is int or kind is float:
+        return _read_number(value, whole=kind is int)
+    return value if isinstance(value, typing.cast(type, kind)) else _WRONG
 
 
-def _read_number(value: Any, kind: type[int] | type[float]) -> Any:
+def _read_number(value: object, whole: bool) -> object:
     """Numbers keep their type, except whole floats where an integer is wanted (YAML's ``1e3``)."""
     if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
         return _WRONG
     if not isinstance(value, int | float):
         value = value.item() if hasattr(value, "item") else float(value)  # NumPy's
-    if kind is int and isinstance(value, float):
+    if whole and isinstance(value, float):
         return int(value) if value.is_integer() else _WRONG
     return value
 
 
-def _read_tuple(value: Any, entries: tuple[Any, ...], name: str) -> Any:
+def _read_tuple(value: object, entries: tuple[object, ...], name: str) -> object:
     if hasattr(value, "tolist"):
         value = value.tolist()
     if not isinstance(value, list | tuple):
@@ -198,7 +200,7 @@ def _read_tuple(value: Any, entries: tuple[Any, ...], name: str) -> Any:
     return tuple(read(item, kind, f"{name}[{i}]", _WRONG) for i, (item, kind) in enumerate(pairs))
 
 
-def _read_dict(value: Any, kind: Any, name: str) -> Any:
+def _read_dict(value: object, kind: object, name: str) -> object:
     if not isinstance(value, Mapping):
         return _WRONG
     return {str(key): read(item, kind, f"{name}.{key}", _WRONG) for key, item in value.items()}

@@ -10,10 +10,9 @@ import itertools
 import re
 import textwrap
 from dataclasses import dataclass
-from typing import Any
 
 from sb3_tbc.settings.fields import plain
-from sb3_tbc.settings.kinds import default_of, hints, section_of
+from sb3_tbc.settings.kinds import Section, default_of, hints, section_of
 from sb3_tbc.settings.texts import describe
 
 
@@ -38,7 +37,7 @@ class Entry:
         return self.name.rpartition(".")[0]
 
 
-def entries(section: type[Any], settings: Any = None, prefix: str = "") -> list[Entry]:
+def entries(section: Section, settings: object = None, prefix: str = "") -> list[Entry]:
     """Every setting of a class: first its own, then those of its sections.
 
     :param section: the settings class
@@ -61,7 +60,7 @@ def entries(section: type[Any], settings: Any = None, prefix: str = "") -> list[
     return own + inner
 
 
-def yaml_text(value: Any) -> str:
+def yaml_text(value: object) -> str:
     """A plain value as YAML writes it on one line."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
@@ -71,7 +70,7 @@ def yaml_text(value: Any) -> str:
 
 
 @functools.cache
-def _help_texts(section: type[Any]) -> dict[str, str]:
+def _help_texts(section: Section) -> dict[str, str]:
     texts: dict[str, str] = {}
     for base in reversed(section.__mro__):
         if dataclasses.is_dataclass(base):
@@ -79,16 +78,16 @@ def _help_texts(section: type[Any]) -> dict[str, str]:
     return texts
 
 
-def help_texts(section: type[Any]) -> dict[str, str]:
+def help_texts(section: Section) -> dict[str, str]:
     """Help text of each field on one line: the string below the field, or ``:param field:`` of the class's docstring.
 
     Base classes are included. Without source code there are no texts.
     """
-    key: Any = section
+    key: object = section
     return _help_texts(key)
 
 
-def _texts_in_source(section: Any) -> dict[str, str]:
+def _texts_in_source(section: type) -> dict[str, str]:
     try:
         source = textwrap.dedent(inspect.getsource(section))
     except (OSError, TypeError):

@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import typing
-from typing import Any, Literal, get_args, get_origin
+from typing import Literal, get_args, get_origin
 
 from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.settings.domains import Prefixed
-from sb3_tbc.settings.kinds import arms, hints, split
+from sb3_tbc.settings.kinds import Section, allows_anything, arms, hints, split
 
-_NAMES = {bool: "true or false", int: "a whole number", float: "a number", str: "text", type(None): "none"}
+_NAMES: dict[object, str] = {
+    bool: "true or false",
+    int: "a whole number",
+    float: "a number",
+    str: "text",
+    type(None): "none",
+}
 
 
-def describe(hint: Any) -> str:
+def describe(hint: object) -> str:
     """What a type allows, in words: ``a number from 0 to 1``."""
     kind, domains = split(hint)
     if any(isinstance(domain, Prefixed) for domain in domains):
@@ -21,9 +27,9 @@ def describe(hint: Any) -> str:
     return " ".join([_describe_kind(kind), *(str(domain) for domain in domains)])
 
 
-def _describe_kind(kind: Any) -> str:
+def _describe_kind(kind: object) -> str:
     origin = get_origin(kind)
-    if kind is Any:
+    if allows_anything(kind):
         return "anything"
     if arms(kind):
         return " or ".join(describe(arm) for arm in arms(kind))
@@ -39,7 +45,7 @@ def _describe_kind(kind: Any) -> str:
     if origin is type:
         return f"a class derived from {get_args(kind)[0].__name__}"
     if dataclasses.is_dataclass(kind):
-        return section_text(hints(typing.cast(type[Any], kind)))
+        return section_text(hints(typing.cast(Section, kind)))
     return _NAMES.get(kind, f"a {getattr(kind, '__name__', kind)}")
 
 
@@ -48,7 +54,7 @@ def section_text(kinds: PlainMapping) -> str:
     return f"a section with some of the keys {', '.join(kinds)}"
 
 
-def remark(value: Any, kind: Any) -> str:
+def remark(value: object, kind: object) -> str:
     """A remark for a text where a number is wanted: the two look alike in a message."""
     wants_number = kind in (int, float) or any(split(arm)[0] in (int, float) for arm in arms(kind))
     return " (text)" if isinstance(value, str) and wants_number else ""

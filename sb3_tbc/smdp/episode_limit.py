@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import time
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
@@ -17,10 +17,10 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_tbc.aliases import Env, Plain
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.aliases import Env, Plain, Wrapper
+from sb3_tbc.arrays import Arrays, BoolArray, FloatArray
 from sb3_tbc.smdp.faults import fault
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
@@ -61,7 +61,7 @@ class LastWindow(NamedTuple):
         return bool(self.subgoals.reached(self.subgoals.achieved(seen), self.subgoal))
 
 
-class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
+class EpisodeLimit(Wrapper, RecordConstructorArgs):
     """Truncates the step that ends the announced last window; refuses observations and infos of the wrong form.
 
     :param env: the task itself; wrappers belong around this one, so that they see the end of the episode
@@ -82,7 +82,7 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         """End the episode with this window."""
         self._last, self._passed = window, 0
 
-    def reset(self, **kwargs: Any) -> tuple[Any, Plain]:
+    def reset(self, **kwargs: Any) -> tuple[object, Plain]:
         """Begin an episode, and forget what was announced."""
         self._last, self._steps = None, 0
         try:
@@ -92,7 +92,7 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         self._check(observation, info)
         return observation, info
 
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, Plain]:
+    def step(self, action: object) -> tuple[object, SupportsFloat, bool, bool, Plain]:
         """Step; the last observation of an episode is copied, as some environments reuse their arrays.
 
         :raises EnvironmentFault: if the task's own code fails, naming environment and step
@@ -113,7 +113,7 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
             observation = {key: np.array(part) for key, part in observation.items()}
         return observation, reward, terminated, truncated, info
 
-    def _check(self, observation: Any, info: Any) -> None:
+    def _check(self, observation: object, info: object) -> None:
         if isinstance(info, dict) and isinstance(observation, dict):
             for key, shape in self._shapes:
                 if getattr(observation.get(key), "shape", None) != shape:
@@ -133,7 +133,7 @@ class EpisodeLimit(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
                 f"environment {self.index}, step {self._steps} of its episode: info must be a dictionary, got {info!r}"
             )
 
-    def _as_declared(self, observation: Any) -> Any:
+    def _as_declared(self, observation: GoalObservation) -> GoalObservation:
         """The observation in the precision in which vectors of environments hand it on."""
         return {key: np.asarray(observation[key], dtype=self._parts[key].dtype) for key in GOAL_KEYS}
 
@@ -167,7 +167,9 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         """Whether the environments have an attribute."""
         return attr_name == ANNOUNCE or super().has_attr(attr_name)
 
-    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: object
+    ) -> list[object]:
         """Call a method of the environments; announcements end here."""
         if method_name != ANNOUNCE:
             return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
@@ -188,15 +190,15 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         self._lengths += 1
         for index, window in list(self._last.items()):
             self._passed[index] += 1
-            seen: Any = {key: observation[key][index] for key in GOAL_KEYS}  # type: ignore[call-overload]
+            seen: GoalObservation = {key: observation[key][index] for key in GOAL_KEYS}  # type: ignore[call-overload]
             if not dones[index] and window.over(int(self._passed[index]), seen):
-                self._end(index, observation, dones, infos[index])
+                self._end(index, observation, dones, infos[index])  # type: ignore[arg-type]
         for ended in np.flatnonzero(dones):
             self._last.pop(int(ended), None)
             self._returns[ended], self._lengths[ended] = 0.0, 0
         return observation, rewards, dones, infos
 
-    def _end(self, index: int, observation: Any, dones: Any, info: Plain) -> None:
+    def _end(self, index: int, observation: Arrays, dones: BoolArray, info: Plain) -> None:
         episode = {"r": float(self._returns[index]), "l": int(self._lengths[index]), "t": time.time() - self._began}
         info |= {BUDGET_EXHAUSTED: True, "TimeLimit.truncated": True, "episode": episode}
         info["terminal_observation"] = {key: np.array(part[index]) for key, part in observation.items()}
@@ -226,10 +228,11 @@ def with_episode_limit(venv: VecEnv) -> VecEnv:
     """
     if venv.has_attr(ANNOUNCE):
         return venv
-    base: Any = venv
+    base: VecEnv = venv
     around: VecEnvWrapper | None = None
     while isinstance(base, VecEnvWrapper):
-        base, around = base.venv, base
+        around = base
+        base = base.venv
     if isinstance(base, DummyVecEnv):
         base.envs = [_put_limit(env, index) for index, env in enumerate(base.envs)]
     elif base.has_attr("class_name") and set(base.env_method("class_name")) == {"Monitor"}:
@@ -249,7 +252,7 @@ def can_tell(venv: VecEnv, subgoals: SubgoalSpace) -> bool:
     :param venv: what the agent acts in, with :func:`with_episode_limit`
     :param subgoals: the agent's
     """
-    base: Any = venv
+    base = venv
     while isinstance(base, VecEnvWrapper) and not isinstance(base, LimitingVecEnv):
         base = base.venv
     if isinstance(base, LimitingVecEnv):

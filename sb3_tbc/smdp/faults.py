@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from multiprocessing.process import BaseProcess
 
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
@@ -55,7 +55,7 @@ def _wait(workers: SubprocVecEnv, steps: AnyArray) -> None:
 
 
 def _dead(workers: SubprocVecEnv, steps: AnyArray) -> str:
-    processes: list[Any] = workers.processes
+    processes: list[BaseProcess] = workers.processes
     until = time.monotonic() + 1.0  # a process that has just closed its pipe takes a moment to be gone
     while time.monotonic() < until and all(process.is_alive() for process in processes):
         time.sleep(0.01)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from gymnasium import spaces
 
 from sb3_tbc.aliases import Space
+from sb3_tbc.arrays import AnyArray
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 """The parts of a goal environment's observation."""
@@ -73,11 +72,11 @@ class UnitActions:
         self.low, self.width, self.dtype = space.low, space.high - space.low, space.dtype
         self.centre, self.half = 0.5 * (space.low + space.high), 0.5 * (space.high - space.low)
 
-    def unscale(self, unit: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def unscale(self, unit: AnyArray) -> AnyArray:
         """The environment's actions for unit ones, of the action space's type; exported code rounds the same way."""
         actions = self.low + 0.5 * (unit + 1.0) * self.width
         return np.asarray(actions, dtype=self.dtype)
 
-    def scale(self, actions: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    def scale(self, actions: AnyArray) -> AnyArray:
         """Unit coordinates of the environment's actions."""
         return np.asarray((actions - self.centre) / self.half)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from sb3_tbc.aliases import Env, Plain
 from sb3_tbc.arrays import AnyArray
@@ -52,7 +52,7 @@ class GoalVecEnv(DummyVecEnv):
             self._note_start(index, seed)
         return super().reset()  # type: ignore[return-value]
 
-    def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
+    def env_method(self, method_name: str, *args: object, indices: VecEnvIndices = None, **kwargs: Any) -> list[object]:
         """Call a method of environments, see SB3; an episode begun this way is noted."""
         if method_name == "reset":
             for index in self._get_indices(indices):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -96,7 +96,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         super().__init__(venv, observation_space=views.low_space(), action_space=venv.action_space)
         self.high_level, self.views, self.rules, self.schedule = high_level, views, rules, schedule
         self.clock = OptionClock(venv.num_envs, views.subgoals, rules)
-        self.unit: Any = UnitActions(self.action_space)  # type: ignore[arg-type]
+        self.unit = UnitActions(self.action_space)  # type: ignore[arg-type]
         self.gives_up = gives_up
         self._everywhere = np.arange(venv.num_envs)
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)

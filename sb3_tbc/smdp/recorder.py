@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.arrays import AnyArray, Arrays, FloatArray
+from sb3_tbc.arrays import AnyArray, Arrays, FloatArray, Indices, IntArray
 from sb3_tbc.smdp.options import Episode, Option, TerminationReason
 from sb3_tbc.smdp.spaces import GoalObservation
 
 REASONS = tuple(TerminationReason)
+
+Place = tuple[Indices | slice, IntArray | int]
+"""Index of rows in arrays ``(n_envs, steps, .)``: environments, and the step of each."""
 
 
 class EpisodeRecorder:
@@ -106,11 +108,11 @@ class EpisodeRecorder:
                 )
             )  # fmt: skip
 
-    def _now(self) -> tuple[Any, Any]:
+    def _now(self) -> Place:
         """Index of every environment's present row; a slice where there is one, which is several times as fast."""
         return (self._all if self.n_envs > 1 else slice(None), self.steps if self.n_envs > 1 else int(self.steps[0]))
 
-    def _write(self, at: tuple[Any, Any], observation: GoalObservation) -> None:
+    def _write(self, at: Place, observation: GoalObservation) -> None:
         for name in ("observation", *self._exact):
             self._data[name][at] = observation[name]
 

@@ -7,7 +7,6 @@ import json
 import re
 import zipfile
 from pathlib import Path
-from typing import Any
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
@@ -142,7 +141,7 @@ def unpickled(data: Plain, name: str, given: Plain, has_env: bool) -> Plain:
     return values
 
 
-def _has_form(data: Any) -> bool:
+def _has_form(data: object) -> bool:
     try:
         return decode(data) is not None
     except (NotPlainError, RecursionError):

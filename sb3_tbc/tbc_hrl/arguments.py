@@ -123,7 +123,7 @@ class SignatureOfSettings:
         return inspect.Signature([parameter for parameter in parameters if not parameter.name.startswith("_")])
 
 
-def _parameter(field: dataclasses.Field[Any], kind: Any) -> inspect.Parameter:
+def _parameter(field: dataclasses.Field[object], kind: Any) -> inspect.Parameter:
     """A field as a keyword argument; a section may be given as a mapping, and None leaves it at its defaults."""
     default = default_of(field)
     if isinstance(default, Settings):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch as th
 from gymnasium import spaces
@@ -33,6 +33,11 @@ class LevelSpaces(NamedTuple):
 
     observation: spaces.Box
     action: spaces.Box
+
+    @classmethod
+    def of_level(cls, level: SACLevel) -> LevelSpaces:
+        """The spaces that a level was made with."""
+        return cls(cast(spaces.Box, level.observation_space), cast(spaces.Box, level.action_space))
 
 
 # ------------------------------------------------------------------------------- the semi-Markov process

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from numbers import Integral, Real
-from typing import Any
+import math
+from numbers import Real
 
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 
-def whole_steps(total_timesteps: Any) -> int:
+def whole_steps(total_timesteps: object) -> int:
     """The number of environment steps to learn for.
 
     :raises TypeError: if it is not a whole number
     :raises ValueError: if it is negative
     """
-    number = isinstance(total_timesteps, (Integral, Real)) and not isinstance(total_timesteps, bool)
-    if not number or total_timesteps != total_timesteps or total_timesteps % 1 != 0:
+    number = total_timesteps if isinstance(total_timesteps, Real) and not isinstance(total_timesteps, bool) else None
+    if number is None or number != number or number % 1 != 0:
         raise TypeError(f"total_timesteps must be a whole number of environment steps, got {total_timesteps!r}")
-    if total_timesteps < 0:
+    if number < 0:
         raise ValueError(f"total_timesteps must not be negative, got {total_timesteps}")
-    return int(total_timesteps)
+    return int(math.trunc(number))
 
 
 def refuse_vec_normalize(env: VecEnv) -> None:
@@ -37,7 +37,7 @@ OF_A_LEVEL = ("gamma", "tau", "batch_size", "buffer_size", "ent_coef", "target_e
 """What SB3's agents of one level let users change between two calls of ``learn``."""
 
 
-def refuse_level_setting(name: str, value: Any) -> None:
+def refuse_level_setting(name: str, value: object) -> None:
     """Refuse to set on the agent what its levels would never read.
 
     :raises AttributeError: naming what to do instead

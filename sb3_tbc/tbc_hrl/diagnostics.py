@@ -6,7 +6,7 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -62,7 +62,14 @@ def record_progress(model: BaseAlgorithm) -> None:
     logger.record("train/n_updates", model._n_updates)
 
 
-def progress_bar_of(callback: BaseCallback) -> Any | None:
+class ProgressBar(Protocol):
+    """What is asked of the bar that SB3 shows, a tqdm bar."""
+
+    def set_description(self, desc: str | None = None, /) -> None:
+        """Show a text on the bar; None shows none."""
+
+
+def progress_bar_of(callback: BaseCallback) -> ProgressBar | None:
     """The bar that SB3 shows while learning; None without one.
 
     :param callback: what ``learn`` calls, its training started
@@ -73,10 +80,10 @@ def progress_bar_of(callback: BaseCallback) -> Any | None:
 
 
 @contextmanager
-def described(bar: Any | None, text: str) -> Iterator[None]:
+def described(bar: ProgressBar | None, text: str) -> Iterator[None]:
     """Show a text on the bar for a while.
 
-    :param bar: a tqdm bar, or None: nothing is shown
+    :param bar: the bar; None: nothing is shown
     :param text: what is going on
     """
     if bar is None or not text:

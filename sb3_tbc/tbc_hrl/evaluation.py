@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +43,10 @@ Agent = TBCHRL | FlatSAC
 """What can be trained and evaluated here."""
 
 
+Row = tuple[float, ...]
+"""The figures of one episode, in the order of :class:`EvaluationResult`'s fields."""
+
+
 def evaluate_agent(
     model: Agent,
     env: VecEnv | Env,
@@ -70,7 +74,7 @@ def evaluate_flat(
         venv.seed(seed)
     observation = venv.reset()
     totals = np.zeros((2, venv.num_envs))  # steps, rewards
-    results: list[list[tuple[Any, ...]]] = [[] for _ in range(venv.num_envs)]
+    results: list[list[Row]] = [[] for _ in range(venv.num_envs)]
     per_env = -(-n_eval_episodes // venv.num_envs)
     while min(len(rows) for rows in results) < per_env:
         actions, _ = model.predict(observation, deterministic=deterministic)  # type: ignore[arg-type]
@@ -117,31 +121,31 @@ def _vector(env: VecEnv | Env, n_eval_episodes: int) -> VecEnv:
     return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
 
 
-def _columns(rows: list[tuple[Any, ...]], n_eval_episodes: int) -> EvaluationResult:
+def _columns(rows: list[Row], n_eval_episodes: int) -> EvaluationResult:
     columns = list(zip(*rows[:n_eval_episodes], strict=True))
     types = (bool, np.int64, np.float64, np.float64, np.float64, np.int64, bool)
     return EvaluationResult(*(np.array(column, dtype=t) for column, t in zip(columns, types, strict=True)))
 
 
-def _run(runner: TwoLevelRunner, per_env: int) -> list[tuple[Any, ...]]:
+def _run(runner: TwoLevelRunner, per_env: int) -> list[Row]:
     """``per_env`` episodes in every environment; one row each, ordered by round, then environment."""
     runner.reset()
-    results: list[list[tuple[Any, ...]]] = [[] for _ in range(runner.env.num_envs)]
+    results: list[list[Row]] = [[] for _ in range(runner.env.num_envs)]
     while min(len(rows) for rows in results) < per_env:
         for index, episode in runner.step().episodes.items():
             results[index].append(_row(episode))
     return [rows[i] for i in range(per_env) for rows in results]
 
 
-def _row(episode: Episode) -> tuple[Any, ...]:
+def _row(episode: Episode) -> Row:
     """What :class:`EvaluationResult` holds of an episode, in its order."""
     options = episode.options
     return (
         episode.success,
         episode.length,
         episode.rewards.sum(),
-        np.mean([option.reached for option in options]),
-        np.mean([option.duration for option in options]),
+        float(np.mean([option.reached for option in options])),
+        float(np.mean([option.duration for option in options])),
         len(options),
         episode.budget_exhausted,
     )

@@ -104,7 +104,7 @@ class FlatSAC(PlainAlgorithm, SAC):
     __signature__ = SignatureOfSettings(SB3Arguments)
 
     @takes(FlatArguments)
-    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str, **arguments: Any) -> None:
+    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str, **arguments: object) -> None:
         sb3, settings = SB3Arguments.taken_from(arguments)
         config = self.config_class.from_dict(settings)
         self.settings = config.to_dict()

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import TypeVar, cast
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
+from sb3_tbc.tbc_hrl.two_level_saving import TwoLevelSaving
+
+Agent = TypeVar("Agent", bound=TwoLevelSaving)
 
 
 class ForeignHigh:
@@ -22,7 +27,7 @@ class ForeignHigh:
         self.algorithm = algorithm
 
     def act(
-        self, observations: FloatArray, states: FloatArray, deterministic: bool, rng: Any, average: bool = False
+        self, observations: FloatArray, states: FloatArray, deterministic: bool, rng: object, average: bool = False
     ) -> tuple[FloatArray, FloatArray]:
         """Unit subgoals and time budgets ``(n, action_dim)``, and the empty states.
 
@@ -34,29 +39,29 @@ class ForeignHigh:
         return np.clip(unit, -1.0, 1.0).astype(np.float32), states
 
 
-def refuse_reconsidering(agent: Any) -> None:
-    """Check that the agent's high level can be replaced by another algorithm.
+def refuse_reconsidering(rules: OptionRules) -> None:
+    """Check that an agent's high level can be replaced by another algorithm.
 
-    :param agent: a :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`
+    :param rules: the agent's
     :raises ValueError: if that high level also ends windows
     """
-    if agent.rules.may_be_reconsidered:
+    if rules.may_be_reconsidered:
         raise ValueError(
             "with window_end='reconsider' an agent's own high level ends windows, which another algorithm cannot do in "
             "its place: use an agent with window_end='timed' or 'reached'"
         )
 
 
-def put_together(high: BaseAlgorithm, low: Any) -> Any:
+def put_together(high: BaseAlgorithm, low: Agent) -> Agent:
     """A copy of an agent whose options another algorithm proposes.
 
     :param low: a :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`
     :raises ValueError: if the algorithm's observations or actions are not those of the agent's high level, or that
         high level ends windows before their time
     """
-    refuse_reconsidering(low)
     views, space = low.policy.views, low.observation_space
-    wanted: tuple[Any, Any] = views.high_space(space), views.high_action_space()
+    refuse_reconsidering(low.policy.rules)
+    wanted = views.high_space(cast(spaces.Dict, space)), views.high_action_space()
     given = high.observation_space, high.action_space
     if given[0].shape != wanted[0].shape or given[1].shape != wanted[1].shape:
         raise ValueError(
@@ -65,7 +70,6 @@ def put_together(high: BaseAlgorithm, low: Any) -> Any:
         )
     agent = copy.copy(low)
     agent.policy = copy.copy(low.policy)
-    actor: Any = TwoLevelActor(ForeignHigh(high), low.low, low.policy.memory)  # type: ignore[arg-type]
-    agent.policy.actor = actor
+    agent.policy.actor = TwoLevelActor(ForeignHigh(high), low.low, low.policy.memory)  # type: ignore[arg-type]
     agent.foreign_high = high
     return agent

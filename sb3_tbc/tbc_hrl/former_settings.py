@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from typing import Any
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.settings import SettingError, Settings, hints, section_of
@@ -12,7 +11,7 @@ from sb3_tbc.settings import SettingError, Settings, hints, section_of
 FORMER_NAMES = {"high_settings": "high", "low_settings": "low"}
 """Attributes of version 0.1.0 and the sections that they have become."""
 
-RETIRED: dict[str, tuple[Any, ...]] = {"hindsight_goals": ("all",), "low.near_misses": (0, None)}
+RETIRED: dict[str, tuple[object, ...]] = {"hindsight_goals": ("all",), "low.near_misses": (0, None)}
 """Settings that no longer exist, each with the values for which leaving it out changes nothing."""
 
 LEVEL_NAMES = ("actor_learning_rate", "batch_size", "buffer_size", "ent_coef", "gamma", "policy_kwargs", "tau",

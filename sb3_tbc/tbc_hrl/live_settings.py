@@ -20,7 +20,7 @@ class LiveSettings(PlainMapping):
     :param change: takes a setting's name and new value
     """
 
-    def __init__(self, name: str, values: PlainMapping, change: Callable[[str, Any], None]) -> None:
+    def __init__(self, name: str, values: PlainMapping, change: Callable[[str, object], None]) -> None:
         self._name, self._values, self._change = name, values, change
 
     def __getitem__(self, key: str) -> Any:
@@ -32,7 +32,7 @@ class LiveSettings(PlainMapping):
     def __len__(self) -> int:
         return len(self._values)
 
-    def __setitem__(self, key: str, value: Any) -> None:
+    def __setitem__(self, key: str, value: object) -> None:
         """Change a setting of the agent.
 
         :raises SettingError: if it is none that can change, or the value is not allowed

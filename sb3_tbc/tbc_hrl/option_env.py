@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from sb3_tbc.arrays import AnyArray, FloatArray
 from sb3_tbc.smdp.episode_limit import ANNOUNCE, LastWindow, with_episode_limit
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
 from sb3_tbc.smdp.options import OptionClock
+from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.tbc_hrl.foreign_high import refuse_reconsidering
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 
@@ -49,7 +50,7 @@ class OptionEnv(VecEnvWrapper):
                 f"OptionEnv steps each environment by itself, past {type(venv).__name__}: give it the DummyVecEnv or "
                 "SubprocVecEnv itself, and put wrappers around the OptionEnv"
             )
-        refuse_reconsidering(agent)
+        refuse_reconsidering(agent.rules)
         space = check_goal_space(venv.observation_space, venv.action_space)
         policy = agent.policy
         super().__init__(
@@ -66,7 +67,7 @@ class OptionEnv(VecEnvWrapper):
 
     def reset(self) -> FloatArray:
         """Begin an episode everywhere."""
-        observation: Any = self.venv.reset()
+        observation = cast(GoalObservation, self.venv.reset())
         self.reset_infos = list(self.venv.reset_infos)
         self._seen = {key: np.array(observation[key]) for key in GOAL_KEYS}
         self._forget(np.arange(self.num_envs))

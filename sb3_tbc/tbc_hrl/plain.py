@@ -10,7 +10,7 @@ import dataclasses
 import importlib
 import sys
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum
 from functools import partial
 from types import FunctionType
@@ -25,6 +25,7 @@ from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, Line
 from torch import nn
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import AnyArray, FloatArray
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
 SCHEDULES = (ConstantSchedule, FloatSchedule, LinearSchedule)
@@ -40,7 +41,7 @@ class NotPlainError(ValueError):
     """An object that cannot be written without pickle, or a table that describes none; the message names it."""
 
 
-def encode(value: Any) -> Any:
+def encode(value: object) -> Any:
     """An object as plain data.
 
     :raises NotPlainError: if it holds something that is not listed here
@@ -53,7 +54,7 @@ def encode(value: Any) -> Any:
     raise NotPlainError(f"{type(value).__module__}.{type(value).__qualname__} has no plain form")
 
 
-def decode(data: Any, depth: int = 0) -> Any:
+def decode(data: object, depth: int = 0) -> Any:
     """The object that :func:`encode` described.
 
     :raises NotPlainError: if the data describes none
@@ -81,7 +82,7 @@ def decode(data: Any, depth: int = 0) -> Any:
 # --------------------------------------------------------------------------------------------- by reference
 
 
-def reference(thing: Any) -> str:
+def reference(thing: type | FunctionType) -> str:
     """Module and name of a class or function.
 
     :raises NotPlainError: if it is not found under that name, or its module belongs to another package
@@ -92,7 +93,7 @@ def reference(thing: Any) -> str:
     return name
 
 
-def find(name: str) -> Any:
+def find(name: str) -> type | FunctionType:
     """The class or function of a reference.
 
     :raises NotPlainError: if the module belongs to another package, or holds no class or function of that name
@@ -103,14 +104,15 @@ def find(name: str) -> Any:
     ):
         raise NotPlainError(f"{name} is not part of this package, Stable-Baselines3, torch.nn, or code of yours in use")
     try:
-        thing: Any = importlib.import_module(module)
-        module = thing.__name__  # where a former name leads
+        home = importlib.import_module(module)
+        thing: object = home
         for part in path.split("."):
             thing = vars(thing)[part]
     except (ImportError, KeyError, TypeError) as error:
         raise NotPlainError(f"{name} does not exist here") from error
-    if not isinstance(thing, type | FunctionType) or thing.__module__ != module or thing.__qualname__ != path:
-        raise NotPlainError(f"{name} is no class or function of {module}")
+    # a former name leads to a module of another name
+    if not isinstance(thing, type | FunctionType) or thing.__module__ != home.__name__ or thing.__qualname__ != path:
+        raise NotPlainError(f"{name} is no class or function of {home.__name__}")
     return thing
 
 
@@ -121,7 +123,7 @@ def _class(name: str) -> type:
     return found
 
 
-def _function(name: str) -> Callable[..., Any]:
+def _function(name: str) -> FunctionType:
     found = find(name)
     ours = name.startswith("sb3_tbc.tasks.")
     if not isinstance(found, FunctionType) or not (ours or _running(found.__module__)):
@@ -137,7 +139,7 @@ def _running(module: str) -> bool:
     return bool(origin) and not installed and not module.startswith("sb3_tbc")
 
 
-def _named(read: Callable[[str], Any], thing: Any) -> str:
+def _named(read: Callable[[str], object], thing: type | FunctionType) -> str:
     """The reference of a thing, after reading it as loading will."""
     name = reference(thing)
     read(name)
@@ -149,19 +151,19 @@ def _is_own_data(kind: type) -> bool:
     return kind.__module__.startswith("sb3_tbc.") and dataclasses.is_dataclass(kind)
 
 
-def _fields(value: Any) -> Plain:
+def _fields(value: object) -> Plain:
     if hasattr(value, "to_dict"):  # settings: written by name, checked when read
         return dict(value.to_dict())
     return dict(vars(value))
 
 
-def _object(**parts: Any) -> Any:
-    kind, fields = find(parts["class"]), parts["fields"]
+def _object(fields: Plain, **parts: str) -> object:
+    kind = find(parts["class"])
     if not (isinstance(kind, type) and (kind is SubgoalSpace or _is_own_data(kind))):
         raise NotPlainError(f"{parts['class']} holds no plain data")
     if hasattr(kind, "from_dict"):
         return kind.from_dict(fields)
-    made: Any = object.__new__(kind)
+    made: object = object.__new__(kind)
     vars(made).update(fields)
     check = getattr(made, "_check", None) or getattr(made, "__post_init__", None)
     if check is not None:
@@ -172,7 +174,7 @@ def _object(**parts: Any) -> Any:
 # --------------------------------------------------------------------------------------------- what there is
 
 
-def _array(value: Any) -> Plain:
+def _array(value: AnyArray | np.generic) -> Plain:
     array = np.asarray(value)
     if array.dtype.kind not in "biuf":
         raise NotPlainError(f"an array of {array.dtype} has no plain form")
@@ -180,7 +182,7 @@ def _array(value: Any) -> Plain:
     return {"dtype": array.dtype.str, "shape": list(array.shape), "values": flat}
 
 
-def _read_array(dtype: str, shape: list[int], values: list[Any]) -> Any:
+def _read_array(dtype: str, shape: list[int], values: list[float | str]) -> AnyArray:
     kind = np.dtype(dtype)
     if kind.kind not in "biuf":
         raise NotPlainError(f"no plain array holds {dtype}")
@@ -188,29 +190,29 @@ def _read_array(dtype: str, shape: list[int], values: list[Any]) -> Any:
     return np.array(plain, dtype=kind).reshape(shape)
 
 
-def _read_scalar(**parts: Any) -> Any:
-    return _read_array(**parts)[()]
+def _read_scalar(dtype: str, shape: list[int], values: list[float | str]) -> object:
+    return _read_array(dtype, shape, values)[()]
 
 
 def _write_box(box: spaces.Box) -> Plain:
     return {"low": encode(box.low), "high": encode(box.high)}
 
 
-def _read_box(low: Any, high: Any) -> spaces.Box:
+def _read_box(low: FloatArray, high: FloatArray) -> spaces.Box:
     return spaces.Box(low, high, dtype=low.dtype)
 
 
-def _write_dict(table: dict[Any, Any]) -> Plain:
+def _write_dict(table: Mapping[object, object]) -> Plain:
     if not all(isinstance(key, str) and key != PLAIN for key in table):
         return {PLAIN: "pairs", "pairs": [[encode(key), encode(item)] for key, item in table.items()]}
-    return {key: encode(item) for key, item in table.items()}
+    return {str(key): encode(item) for key, item in table.items()}
 
 
-def _write_partial(call: partial[Any]) -> Plain:
+def _write_partial(call: partial[object]) -> Plain:
     return {"call": encode(call.func), "arguments": encode(list(call.args)), "named": encode(dict(call.keywords))}
 
 
-def _read_schedule(name: str, fields: Plain) -> Any:
+def _read_schedule(name: str, fields: Plain) -> object:
     kind = next((kind for kind in SCHEDULES if kind.__name__ == name), None)
     if kind is None:
         raise NotPlainError(f"unknown schedule {name!r}")
@@ -219,7 +221,7 @@ def _read_schedule(name: str, fields: Plain) -> Any:
     return made
 
 
-WRITERS: tuple[tuple[Any, str, Callable[[Any], Any]], ...] = (
+WRITERS: tuple[tuple[type | tuple[type, ...], str, Callable[[Any], Any]], ...] = (
     ((type(None), bool, str), "", lambda value: value),
     (np.generic, "number", _array),
     (Enum, "unit", lambda value: {"name": TrainFrequencyUnit(value).name}),
@@ -242,7 +244,7 @@ WRITERS: tuple[tuple[Any, str, Callable[[Any], Any]], ...] = (
 )
 """Kinds of objects, the name each is written under (none: as itself), and how. The first that fits is taken."""
 
-READERS: dict[str, Callable[..., Any]] = {
+READERS: dict[str, Callable[..., object]] = {
     "number": _read_scalar,
     "array": _read_array,
     "box": _read_box,
@@ -262,7 +264,7 @@ READERS: dict[str, Callable[..., Any]] = {
 }
 
 
-def _read_partial(call: Any, arguments: list[Any], named: Plain) -> partial[Any]:
+def _read_partial(call: object, arguments: list[object], named: Plain) -> partial[object]:
     if not isinstance(call, FunctionType) or not call.__module__.startswith("sb3_tbc.tasks."):
         raise NotPlainError("only functions of tasks can have arguments filled in")
     return partial(call, *arguments, **named)

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 
 from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray
 from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.level.level import SACLevel
-from sb3_tbc.level.policies import NDBCActor
+from sb3_tbc.level.policies import LevelPolicy, NDBCActor
 from sb3_tbc.ndbc.diagnostics import check_finite
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions
 from sb3_tbc.smdp.hierarchical_vec_env import Schedule
@@ -67,7 +68,7 @@ class TBCPolicy(BasePolicy):
         reconsideration = Reconsideration(high, views, rules, reconsider_margin) if rules.may_be_reconsidered else None
         self.actor = TwoLevelActor(high, low, memory, reconsideration)
         self.views, self.rules, self.memory, self.schedule = views, rules, memory, schedule
-        self.unit: Any = UnitActions(action_space)
+        self.unit = UnitActions(action_space)
         self.rng = np.random.default_rng(seed)
         for level in (self.high_policy, self.low_policy):
             level.register_load_state_dict_post_hook(_read_again)  # type: ignore[no-untyped-call]
@@ -160,7 +161,7 @@ class TBCPolicy(BasePolicy):
             check_finite(actor.net.wiring, seen[one], membrane[one], unit[one], "low", step)
         raise NonFiniteError(f"low level, step {step}: action {unit[row].tolist()} for inputs {seen[row].tolist()}")
 
-    def _as_batch(self, observation: Any) -> tuple[Arrays, bool]:
+    def _as_batch(self, observation: object) -> tuple[Arrays, bool]:
         if not isinstance(observation, dict) or any(key not in observation for key in GOAL_KEYS):
             found = sorted(observation) if isinstance(observation, dict) else type(observation).__name__
             raise ValueError(f"predict needs a goal observation with the keys {sorted(GOAL_KEYS)}, got {found}")
@@ -170,12 +171,12 @@ class TBCPolicy(BasePolicy):
         single = batch["observation"].ndim == 1
         return ({key: part[None] for key, part in batch.items()} if single else batch), single
 
-    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """SB3's tensor form of a single, memoryless step."""
-        batch = {key: np.asarray(part) for key, part in observation.items()}
+        batch = {key: np.asarray(part) for key, part in cast(TensorDict, observation).items()}
         return th.as_tensor(self.predict(batch, deterministic=deterministic)[0])
 
-    def forward(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """Same as ``_predict``."""
         return self._predict(observation, deterministic)
 
@@ -184,6 +185,6 @@ def _packed(clock: OptionClock, membrane: FloatArray) -> TwoLevelState:
     return TwoLevelState(**{name: getattr(clock, name) for name in OptionClock.carried}, membrane=membrane)
 
 
-def _read_again(level: Any, _: Any) -> None:
+def _read_again(level: LevelPolicy, _: object) -> None:
     """Let a level act from weights that were just loaded into it."""
     level.after_updates(0)

@@ -33,7 +33,7 @@ from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.calls import refuse_level_setting, refuse_vec_normalize, whole_steps
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
-from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, described, progress_bar_of, record_progress
+from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, ProgressBar, described, progress_bar_of, record_progress
 from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, mismatch_explained, reward_range
 from sb3_tbc.tbc_hrl.foreign_high import put_together
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
@@ -69,13 +69,14 @@ class TBCHRL(TwoLevelSaving):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"MultiInputPolicy": TBCPolicy}
     policy: TBCPolicy
-    foreign_high: BaseAlgorithm | None = None
-    """The algorithm that proposes options in the place of the high level, see :meth:`from_levels`."""
     config_class: ClassVar[type[TBCConfig]] = TBCConfig
+    stop_requested: bool
+    """Set it, from a signal handler or another thread, to make :meth:`learn` return at the next point from which
+    learning can be continued exactly; it stays set until you set it to False."""
     __signature__ = SignatureOfSettings(HierarchyArguments)
 
     @takes(TBCArguments)
-    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **arguments: Any) -> None:
+    def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **arguments: object) -> None:
         check_top_names(arguments)
         others, settings = HierarchyArguments.taken_from(arguments)
         config = self.config_class.from_dict(settings)
@@ -117,16 +118,16 @@ class TBCHRL(TwoLevelSaving):
     def _live_settings(self, name: str) -> LiveSettings:
         return LiveSettings(name, self.settings[name], lambda key, value: self._change_setting(name, key, value))
 
-    def _change_setting(self, name: str, key: str, value: Any) -> None:
+    def _change_setting(self, name: str, key: str, value: object) -> None:
         settings = {**self.settings, name: {**self.settings[name], key: value}}
         self.config = self.config_class.from_dict(settings)
         self.settings = self.config.to_dict()
-        level = self.high if name == "high" else self.low
+        level, config = (self.high, self.config.high) if name == "high" else (self.low, self.config.low)
         if key == "learning_rate":
-            level.learning_rate = learning_rate_of(value)
+            level.learning_rate = learning_rate_of(config.learning_rate)
             level._setup_lr_schedule()
         elif key == "tau":
-            level.tau = value
+            level.tau = config.tau
 
     @property
     def dt_max(self) -> float:
@@ -146,7 +147,7 @@ class TBCHRL(TwoLevelSaving):
                 return getattr(self.config, name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
-        def __setattr__(self, name: str, value: Any) -> None:
+        def __setattr__(self, name: str, value: object) -> None:
             """Refuse what changes nothing: settings of a level, as SB3's agents of one level have them."""
             refuse_level_setting(name, value)
             super().__setattr__(name, value)
@@ -240,10 +241,6 @@ class TBCHRL(TwoLevelSaving):
 
     # ------------------------------------------------------------------ learning
 
-    stop_requested: bool
-    """Set it, from a signal handler or another thread, to make :meth:`learn` return at the next point from which
-    learning can be continued exactly; it stays set until you set it to False."""
-
     @property
     def actor(self) -> TwoLevelActor:
         """Both levels acting together."""
@@ -317,7 +314,7 @@ class TBCHRL(TwoLevelSaving):
         if log_interval and self._episode_num % log_interval == 0:
             self.dump_logs()
 
-    def _prepare_updates(self, total_timesteps: int, bar: Any | None) -> None:
+    def _prepare_updates(self, total_timesteps: int, bar: ProgressBar | None) -> None:
         """Compile now; the progress bar says so, and the logged speed does not count it.
 
         :param total_timesteps: environment steps to come, and those before a resumed run was stopped
@@ -431,8 +428,7 @@ class TBCHRL(TwoLevelSaving):
         :param low: the agent that executes the options
         :raises ValueError: if the two do not fit
         """
-        agent: TBCHRL = put_together(high, low)
-        return agent
+        return put_together(high, low)
 
     def save(self, *args: Any, **kwargs: Any) -> None:
         """Save the agent, see SB3.

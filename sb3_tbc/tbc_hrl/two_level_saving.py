@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import io
 import pathlib
-from typing import Any
 
 import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import TensorDict
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import Arrays
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.tbc_hrl import resume
@@ -32,12 +35,14 @@ class TwoLevelSaving(PlainAlgorithm):
     diagnostics: EpisodeDiagnostics
     collector: Collector | None
     _resumed: Plain
+    foreign_high: BaseAlgorithm | None = None
+    """The algorithm that proposes options in the place of the high level, see :meth:`from_levels`."""
 
     def _make_replay(self, high_spaces: LevelSpaces, low_spaces: LevelSpaces, high_seed: int, low_seed: int) -> None:
         """Empty replay buffers for both levels, and what fills them."""
         raise NotImplementedError
 
-    def learning_state(self) -> dict[str, np.ndarray[Any, Any]]:
+    def learning_state(self) -> Arrays:
         """What learning goes on from besides weights and replay, as plain arrays: random streams, open options."""
         return resume.get_state(self._moving_parts())
 
@@ -65,9 +70,11 @@ class TwoLevelSaving(PlainAlgorithm):
             state_dicts += ["reachability", "reachability.optimizer"]
         return state_dicts, variables
 
-    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
         """Load parameters of both levels in place, see SB3."""
-        super().set_parameters(*args, **kwargs)
+        super().set_parameters(load_path_or_dict, exact_match, device)
         for level in (self.high, self.low):
             level.refresh()
 
@@ -86,7 +93,6 @@ class TwoLevelSaving(PlainAlgorithm):
         :raises ValueError: if the file was written for other spaces or sizes
         """
         if getattr(self, "replay_buffer", None) is None:
-            levels: Any = (self.high, self.low)
-            high, low = (LevelSpaces(level.observation_space, level.action_space) for level in levels)
+            high, low = map(LevelSpaces.of_level, (self.high, self.low))
             self._make_replay(high, low, *self.rng.integers(2**31, size=2).tolist())
         self._resumed = self.replay_buffer.load(path)
