@@ -101,7 +101,7 @@ class AntFourRooms(MujocoTask):
     * Start: in one of the three other rooms, standing still.
     * Subgoals (5): x, y, z (at most 1), v_x, v_y (clipped to +-3 m/s); thresholds 0.4, 0.4, 0.2, 0.8, 0.8.
 
-    Quirks kept: one simulator sub-step at reset. Mended (unless ``legacy_quirks=True``): the public subgoals read the
+    Quirks kept: one simulator sub-step at reset. Fixed (unless ``legacy_quirks=True``): the public subgoals read the
     angle of ankle 4 and v_x where v_x and v_y are meant (an index off by one); solver warm start and clock of the
     episode before survive its reset.
     """

@@ -42,7 +42,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     keyword arguments only.
 
     :param observation: ``"paper"`` (sizes of the paper's table 1) or ``"compact"`` (the public benchmark's vector)
-    :param legacy_quirks: reproduce the slips of the public implementation, listed in each task's docstring
+    :param legacy_quirks: reproduce the errors of the public implementation, listed in each task's docstring
     :param render_mode: ``None``, ``"rgb_array"`` or ``"human"``
     :raises ValueError: for an unknown layout or render mode
     """
@@ -76,7 +76,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     """The same for ``achieved_goal`` and ``desired_goal``."""
     subgoals: SubgoalSpace
     _not_copied: ClassVar[tuple[str, ...]] = ("_viewer",)
-    """Attributes that a copy begins without: windows, contexts, handles of engines."""
+    """Attributes that are not copied: windows, contexts, handles of engines."""
 
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
@@ -159,12 +159,12 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         return {key: value for key, value in vars(self).items() if key not in self._not_copied}
 
     def __setstate__(self, state: Plain) -> None:
-        """Take over what :meth:`__getstate__` gave and connect it with an engine again."""
+        """Restore what :meth:`__getstate__` gave, and connect it with an engine again."""
         self.__dict__.update(dict.fromkeys(self._not_copied), **state)
         self._reconnect()
 
     def _reconnect(self) -> None:
-        """Make what cannot be copied, and put the physics into the state that the copied attributes tell."""
+        """Make what cannot be copied, and put the physics into the state that the copied attributes describe."""
 
     def reset(self, *, seed: int | None = None, options: PlainMapping | None = None) -> tuple[Observation, Plain]:
         """Start an episode.
@@ -264,7 +264,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         text: str | None = None,
         steps_left: int | None = None,
     ) -> None:
-        """Say what an agent pursues, to be drawn by :meth:`render` until the next reset.
+        """Set what an agent pursues, which :meth:`render` draws until the next reset.
 
         :param subgoal: live subgoal in task units, ``(subgoal_dim,)``
         :param time_left: remaining share of the time budget, 0 to 1
@@ -314,7 +314,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         self._apply_dynamics({name: scales.get(name, 1.0) for name in self.dynamics_names})
 
     def _apply_dynamics(self, scales: dict[str, float]) -> None:
-        """Take over factors, one for each of :attr:`dynamics_names`."""
+        """Apply factors, one for each of :attr:`dynamics_names`."""
 
     def check_action(self, action: ArrayLike) -> None:
         """Refuse what :meth:`step` would refuse.

@@ -1,4 +1,4 @@
-"""Environments of Gymnasium-Robotics by their plain ids, and on versions of MuJoCo that it does not know yet."""
+"""Makes environments of Gymnasium-Robotics available by their plain ids, also with versions of MuJoCo newer than it."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def import_quietly(module: str) -> None:
 
 
 def home_of(env_id: str) -> str | None:
-    """The module that registers an id, imported on the way: ``gymnasium_robotics`` or, for known ids, ``""``.
+    """Import and name the module that registers an id: ``gymnasium_robotics``, or ``""`` if the id is known already.
 
     :param env_id: without a module, e.g. ``FetchReach-v4``
-    :return: ``None`` if nobody knows the id, or Gymnasium-Robotics would but is not installed
+    :return: ``None`` if the id is unknown, or Gymnasium-Robotics is needed and not installed
     """
     if env_id not in gym.registry:
         try:
@@ -65,7 +65,7 @@ def mend_joint_types() -> bool:
 
 
 class _PlainJoints:
-    """The module MuJoCo seen through, but for the joint types, which are integers."""
+    """The module MuJoCo with its joint types as plain integers; everything else is passed through."""
 
     def __init__(self, module: ModuleType) -> None:
         self._module = module

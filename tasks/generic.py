@@ -1,4 +1,4 @@
-"""Any goal environment: a subgoal space derived from its ``achieved_goal``, and what our own tasks have besides."""
+"""Makes any goal environment usable: derives a subgoal space from ``achieved_goal``, adds what our own tasks have."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 
 
 class GoalEnvDescription(NamedTuple):
-    """What a hierarchical agent has to know of a task; our own tasks carry these as attributes."""
+    """What a hierarchical agent needs to know about a task; our own tasks have these as attributes."""
 
     subgoals: SubgoalSpace
     achieved_in_observation: bool
@@ -50,10 +50,10 @@ def describe_goal_env(
 ) -> GoalEnvDescription:
     """Subgoal space, scales and episode length of any goal environment.
 
-    Subgoals are points of ``achieved_goal``. What is not given is read from random episodes, not from what is declared:
-    bounds from where desired goals and nine tenths of the achieved ones lie, widened by a tenth, within the declared
-    Box; thresholds from how far off a goal the task's reward (or success test, where the reward is dense) still counts
-    as the goal; scales from what was seen. Runs of four coordinates that are unit quaternions are compared by angle.
+    Subgoals are points of ``achieved_goal``. What is not given is measured in random episodes. Bounds: where desired
+    goals and nine tenths of the achieved ones lie, widened by a tenth, within the declared Box. Thresholds: the largest
+    distance from a goal at which the task's reward (or success test, if the reward is dense) counts it as reached.
+    Scales: the largest observations. Four neighbouring coordinates that are unit quaternions are compared by angle.
 
     :param env: a goal environment; random episodes are run in it, so reset it afterwards
     :param low: lower bounds of subgoals, ``(goal_dim,)``
@@ -62,7 +62,7 @@ def describe_goal_env(
     :param names: of the coordinates
     :param n_probe_steps: length of the random episodes together
     :param seed: of the random episodes
-    :raises ValueError: if the environment is no goal environment, does not tell when a goal is reached, or bounds do
+    :raises ValueError: if the environment is not a goal environment, does not tell when a goal is reached, or bounds do
         not fit
     """
     check_goal_env(env)
@@ -178,7 +178,7 @@ def _extent(probe: Probe) -> tuple[Floats, Floats]:
 def _bounds(
     env: Env, extent: tuple[Floats, Floats], low: ArrayLike | None, high: ArrayLike | None
 ) -> tuple[Floats, Floats]:
-    """Given bounds, else what was seen and a margin, within what is declared."""
+    """Given bounds; else the extent that was seen and a margin, within the declared Box."""
     assert isinstance(env.observation_space, spaces.Dict)
     box = env.observation_space["achieved_goal"]
     assert isinstance(box, spaces.Box)
@@ -202,7 +202,7 @@ def _given_thresholds(given: ArrayLike, dim: int) -> Tolerances:
 
 
 def _contains(observation: Floats, achieved: Floats) -> bool:
-    """Whether each coordinate of the achieved goal is some entry of the observation throughout."""
+    """Whether each coordinate of the achieved goal always equals some entry of the observation."""
     return all(np.isclose(observation, column[:, None], atol=1e-6).all(axis=0).any() for column in achieved.T)
 
 

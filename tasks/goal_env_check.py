@@ -1,4 +1,4 @@
-"""What a goal environment lacks: asked with exactly the calls that training makes, answered with cures."""
+"""Checks a goal environment with the calls that training makes; each problem is reported with its cure."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def _open_context(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, 
 
 
 def _forget_pyopengl() -> None:
-    """Have PyOpenGL imported afresh, because it stays with the backend that it met first, be it one that failed."""
+    """Make PyOpenGL be imported again, because it keeps the backend that it found first, even one that failed."""
     os.environ.pop("PYOPENGL_PLATFORM", None)
     backends = ("mujoco.egl", "mujoco.osmesa")
     for name in list(sys.modules):
@@ -102,7 +102,7 @@ class Scene:
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
         self._gl, self._context = _open_context(model, width, height)
         self.close = weakref.finalize(self, _release, self._gl, self._context)
-        """Give the OpenGL context back; happens by itself when nobody needs it, at the latest when Python ends."""
+        """Free the OpenGL context; also called when the scene is deleted, at the latest when Python ends."""
         self.close.atexit = False
         atexit.register(self.close)  # weakref's own hook may run only after EGL has ended
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._context)
@@ -117,7 +117,7 @@ class Scene:
         self._ghost_data = mujoco.MjData(model)
 
     def update(self, data: mujoco.MjData) -> None:
-        """Take over the present poses; forgets ghosts and markers."""
+        """Show the present poses; removes ghosts and markers."""
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(self.model, data, self._option, self._perturb, self._camera, everything, self.scene)
 

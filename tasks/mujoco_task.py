@@ -26,7 +26,7 @@ class MujocoTask(GoalTask):
     xml: ClassVar[str]
     """The model that is stepped."""
     drawn_xml: ClassVar[str | None] = None
-    """The same joints with what is only to be seen: shapes that collide with nothing would slow every step down."""
+    """The model that is drawn: the same joints, with shapes that are only seen and would slow down every step."""
     frame_skip: ClassVar[int]
     dynamics_names: ClassVar[tuple[str, ...]] = ("mass", "damping", "gravity", "friction", "actuator")
     _not_copied: ClassVar[tuple[str, ...]] = ("_viewer", "_scene", "_drawn", "model", "_qpos", "_qvel", "_ctrl")

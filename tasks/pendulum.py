@@ -36,7 +36,7 @@ class Pendulum(GoalTask):
     * Start: angle uniform in [pi/4, 7 pi/4], velocity within +-0.05; 1000 steps.
     * Subgoals (2): angle and velocity, thresholds as for the goal.
 
-    Quirks kept: one simulator sub-step at reset; the evaluation goals are the training goals. Mended (unless
+    Quirks kept: one simulator sub-step at reset; the evaluation goals are the training goals. Fixed (unless
     ``legacy_quirks=True``): the sub-step at reset acts under the last torque of the episode before; a subgoal angle of
     exactly pi reads as 0.
     """

@@ -51,7 +51,7 @@ class Platforms(ReplayedTask):
     * Subgoals (4): ball position and velocity in [-1, 1]; thresholds 0.05 m and 0.2 m/s, Euclidean.
 
     Quirks kept: velocities are clipped to 0.9 m/s and 19.9 rad/s after each step; the trigger's clock stays where it
-    ended. Mended (unless ``legacy_quirks=True``): platform 1's velocity is computed with platform 0's frequency, 1.5
+    ended. Fixed (unless ``legacy_quirks=True``): platform 1's velocity is computed with platform 0's frequency, 1.5
     times too large; a reset leaves platforms (in a fresh environment at the origin) and contact impulses as they were.
     """
 

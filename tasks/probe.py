@@ -1,4 +1,4 @@
-"""Random episodes in a goal environment: what it shows and pays, before anything is believed of it."""
+"""Random episodes in a goal environment: its observations and rewards, from which its properties are measured."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def run_probe(env: Env, n_steps: int, seed: int = 0, episode_steps: int = 50) ->
 
 
 def said_success(info: Plain) -> bool | None:
-    """Success of a step as its ``info`` says it, under ``is_success`` or ``success``; None where it says nothing."""
+    """Success of a step by the entry ``is_success`` or ``success`` of its ``info``; None if there is neither."""
     said = info.get("is_success", info.get("success"))
     return None if said is None else bool(np.all(said))
 

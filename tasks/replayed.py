@@ -1,4 +1,4 @@
-"""Tasks whose engine cannot be copied: a copy builds its own engine and repeats there what was done in the original."""
+"""Tasks whose engine cannot be copied: a copy builds its own engine and repeats in it all steps of the original."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class Played(NamedTuple):
 class ReplayedTask(GoalTask):
     """Keeps a record of starts and actions since its world was built, from which a copy is brought to the same state.
 
-    Engines like Box2D and Bullet give their state away only in part (impulses and the order of contacts are missing),
-    so that repeating the same calls is the only exact way. A record holds the present episode alone where each episode
+    Engines like Box2D and Bullet expose only a part of their state (impulses and the order of contacts are missing), so
+    that repeating the same calls is the only exact way. A record holds the present episode alone where each episode
     has a fresh world. Under ``legacy_quirks`` Box2D worlds live on, and the record grows by eight bytes per number.
     """
 

@@ -1,4 +1,4 @@
-"""When a foreign task calls a goal reached: read from its own reward or success test, asked at observed goals only."""
+"""Finds out when another package's task counts a goal as reached, from its reward or success test at observed goals."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ Test = Callable[[Floats, Floats], NDArray[np.bool_]]
 """Maps achieved and desired goals ``(n, goal_dim)`` to whether each goal is reached, ``(n,)``."""
 
 OWN_TESTS = ("_is_success", "task.is_success")
-"""Success tests as Gymnasium-Robotics and highway-env, and panda-gym, have them; of the unwrapped environment."""
+"""Names of success tests in unwrapped environments: of Gymnasium-Robotics and highway-env, and of panda-gym."""
 
 
 class SuccessTest(NamedTuple):
-    """Where a task says that a goal is reached, and the reward that it pays there."""
+    """What tells that a goal of a task is reached, and the reward at the goal."""
 
     best: float
     own: str | None = None  # one of OWN_TESTS
     vectorised: bool = True  # whether the own test takes batches
-    worst: float | None = None  # the reward elsewhere, where it is the same everywhere else
-    near: SubgoalSpace | None = None  # its thresholds, as the user gave them; without these two the reward says it
+    worst: float | None = None  # the reward away from the goal, if it is the same everywhere
+    near: SubgoalSpace | None = None  # thresholds that the user gave; without own and near the reward tells
 
     def function_for(self, env: Env) -> Test:
         """The test as a function that asks an environment."""
@@ -50,7 +50,7 @@ def compute_reward_of(env: Env) -> Callable[[Floats, Floats], Floats]:
 
 
 def success_test_of(env: Env, probe: Probe, near: SubgoalSpace | None, seed: int = 0) -> SuccessTest:
-    """Find out when a task calls a goal reached.
+    """Find out when a task counts a goal as reached.
 
     A reward of two values is its own test: the higher one is paid at the goal. A dense reward does not tell, so that
     the task's success test is used, see :data:`OWN_TESTS`, or the thresholds that the user gives.
@@ -74,7 +74,7 @@ def success_test_of(env: Env, probe: Probe, near: SubgoalSpace | None, seed: int
     wrong = 0 if found.near else _disagreements(found.function_for(env), probe)
     if wrong:
         raise ValueError(
-            f"its info says otherwise than its {found.own or 'reward'} whether the goal is reached, in {wrong} of "
+            f"its info contradicts its {found.own or 'reward'} on whether the goal is reached, in {wrong} of "
             f"{len(probe.after)} random steps"
         )
     return found
@@ -130,7 +130,7 @@ def _own_test(env: Env, best: float, probe: Probe, near: SubgoalSpace | None) ->
         return SuccessTest(best, near=near)
     raise ValueError(
         "its reward is dense, and no success test of its own tells when a goal is reached; use its sparse variant, or "
-        "say how near is near enough: thresholds=..., on the command line --hyperparams subgoals.thresholds:0.1"
+        "give the distances that count as reached: thresholds=..., with a command --hyperparams subgoals.thresholds:0.1"
     )
 
 

@@ -44,7 +44,7 @@ class Tennis2D(ReplayedTask):
     * Subgoals (6): joint angles and velocities in [-1, 1], thresholds 0.2; the low level sees only these. The second
       bounce is an event: it returns control to the high level, and it alone can give hindsight goals.
 
-    Mended (unless ``legacy_quirks=True``): the shot's spin never reaches the ball, which keeps the spin of the episode
+    Fixed (unless ``legacy_quirks=True``): the shot's spin never reaches the ball, which keeps the spin of the episode
     before; solver impulses survive a reset; success does not end the episode; rounding adds a 501st step (through
     ``gymnasium.make`` only with ``max_episode_steps=501``).
     """

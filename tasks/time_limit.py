@@ -1,4 +1,4 @@
-"""How long an episode may last: the one reading of time limits that everything else asks."""
+"""How long an episode may last: the one place where time limits are read."""
 
 from __future__ import annotations
 

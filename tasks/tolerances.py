@@ -1,4 +1,4 @@
-"""How far off a goal still counts as the goal: thresholds of subgoals, read from a task's success test by bisection."""
+"""Thresholds of subgoals: how far from a goal a task's success test still counts it as reached, found by bisection."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from .probe import Floats
 from .success_test import Test
 
 N_GOALS = 8
-"""Observed goals asked about."""
+"""Number of observed goals that the test is asked about."""
 HALVINGS = 40
 
 
@@ -40,8 +40,8 @@ def tolerances_of(success: Test, goals: Floats, span: Floats, rotated: list[list
     """Ask a success test how far each coordinate, and each rotation, may be off.
 
     Coordinates that count together, as in a Euclidean distance, share a group. A coordinate that the task ignores gets
-    twice the widest span of all: every subgoal is reached in it. Where the task wants the very value, it is 5 % of the
-    span.
+    twice the widest span of all, so that every subgoal counts as reached in it. If the task demands the exact value,
+    the tolerance is 5 % of the span.
 
     :param success: the task's test
     :param goals: observed goals ``(n, goal_dim)``
@@ -63,7 +63,7 @@ def tolerances_of(success: Test, goals: Floats, span: Floats, rotated: list[list
 
 
 def _largest(success: Test, goals: Floats, directions: Floats) -> Floats:
-    """Largest share of each direction ``(k, goal_dim)`` that every goal tolerates, ``(k,)``; 1 where all of it."""
+    """Largest share of each direction ``(k, goal_dim)`` that every goal tolerates, ``(k,)``; at most 1."""
     k = len(directions)
     desired = np.repeat(goals, k, axis=0)
     along = np.tile(directions, (len(goals), 1))

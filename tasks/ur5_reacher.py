@@ -136,7 +136,7 @@ class UR5Reacher(MujocoTask):
     A sphere and a capsule stand for the original collision meshes; free motion is the original's.
 
     Quirks kept: one simulator sub-step at reset; no wrap-around between +350 and -10 degrees; training goals are the
-    evaluation goals. Mended (unless ``legacy_quirks=True``): the sub-step at reset acts under the last command of the
+    evaluation goals. Fixed (unless ``legacy_quirks=True``): the sub-step at reset acts under the last command of the
     episode before, with its solver warm start.
     """
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MAX_STEPS = 500
-"""Steps whose currents are averaged."""
+"""Number of steps whose currents are averaged."""
 
 
 def draw_agent(model: TBCHRL, task: str, units: CircuitUnits, traces: Sequence[Trace], ax: Axes | None = None) -> Axes:

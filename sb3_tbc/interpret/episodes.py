@@ -20,9 +20,9 @@ from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.zoo.environments import make_env
 
 FIRST_SEED = 50_000_000
-"""Of the first held-out episode; runs seed training and evaluations far below it."""
+"""Seed of the first held-out episode; the seeds of training and evaluations are far below it."""
 MAX_SIDE_BY_SIDE = 160
-"""Environments that step together: acting costs about the same for one as for many."""
+"""Number of environments that step together: acting costs about the same for one as for many."""
 
 
 class Trace(NamedTuple):

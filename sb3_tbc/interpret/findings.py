@@ -35,11 +35,11 @@ PAPER = {
     "information_mean": 0.36,
     "information_p90": 0.52,
 }
-"""Section 5.2, of the UR5Reacher's circuit."""
+"""The paper's figures for the circuit of UR5Reacher (section 5.2)."""
 
 
 class Effort(NamedTuple):
-    """How much work the lesions may be."""
+    """How many lesions are made."""
 
     n_random: int = 5
     max_alone: int = 24

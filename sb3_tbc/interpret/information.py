@@ -12,7 +12,7 @@ from sb3_tbc.arrays import FloatArray
 
 ACTIVATION_BINS, PHASE_BINS, N_SHUFFLES = 8, 4, 50
 SHORTEST_WINDOW = PHASE_BINS
-"""Steps; shorter windows do not have all phases."""
+"""Fewest steps of a window that counts; shorter ones do not have all phases."""
 
 
 class PhaseInformation(NamedTuple):

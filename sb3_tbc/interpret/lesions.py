@@ -13,7 +13,7 @@ from sb3_tbc.interpret.units import CircuitUnits, Lesion, Units, clamp, no_lesio
 
 N_RESAMPLES = 2000
 MAX_STEPS = 3000
-"""Steps on which actions are compared."""
+"""Number of steps on which actions are compared."""
 
 
 class Drop(NamedTuple):

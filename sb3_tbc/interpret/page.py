@@ -27,7 +27,7 @@ SIMULATED: dict[str, tuple[Plain, ...]] = {
     "Pendulum": ({}, {"observation": "compact"}, {"observation": "paper"}),
     "Drawbridge": ({"observation": "compact"},),
 }
-"""Tasks that the page simulates, and the arguments with which they are what it simulates."""
+"""Tasks that the page can simulate, each with the arguments of the variants that it simulates."""
 STEPS_PER_SECOND = {"Pendulum": 50, "Drawbridge": 100, "AntFourRooms": 10, "UR5Reacher": 33}
 N_STARTS = 5
 

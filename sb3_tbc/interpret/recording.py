@@ -29,7 +29,7 @@ class FilmSize(NamedTuple):
 
 WHOLE, LESIONED = FilmSize(60, 320, 70), FilmSize(24, 200, 50)
 MOST_BYTES = 2_200_000
-"""Of all episodes of a page together: the page stays below three million."""
+"""Most bytes of all episodes of a page together; the page then stays below three million bytes."""
 
 
 def recorded_starts(
@@ -67,7 +67,7 @@ def _start(k: int, trace: Trace, space: TaskSpace, model: TBCHRL, whole: Plain) 
 
 
 def _goal_place(trace: Trace, space: TaskSpace, model: TBCHRL) -> list[float] | None:
-    """Where the desired goal lies, if a goal is the beginning of a subgoal, as on most tasks."""
+    """Where the desired goal lies; None unless a goal has the first coordinates of a subgoal, as on most tasks."""
     goal, subgoals = trace.episode.desired_goal[0], model.views.subgoals
     if len(goal) < 2 or subgoals.names[0] not in ("pan", "x", "angle"):
         return None
@@ -125,7 +125,7 @@ def film(model: TBCHRL, env: Env, trace: Trace, seed: int, size: FilmSize) -> Pl
 
 
 def _picture(env: Env) -> Any:
-    """The task's picture; None, with a notice, where it cannot draw itself: the page does without."""
+    """The task's picture; None, with a notice, if it cannot be drawn: the page then has no film."""
     try:
         return env.render()
     except Exception as error:  # An environment's own code, or a missing OpenGL, may fail in any way.

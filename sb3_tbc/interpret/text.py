@@ -68,7 +68,7 @@ def _lesions(found: Findings) -> str:
         some = [r for r in found.lesions if r.what == what and r.clamped_to in ("mean", "")]
         some.sort(key=lambda r: (-(r.success.drop if r.success else 0.0), -r.action_change))
         rows += [_lesion_row(r) for r in some[:8]]
-    note = "alone: one unit clamped. unread: it goes on acting on other units, the readout alone does not hear it."
+    note = "alone: one unit clamped. unread: the unit still acts on other units, but the readout does not hear it."
     if found.success == 0:
         note += "\nThe agent never succeeds, so success cannot drop."
     return _table(rows) + "\n" + note

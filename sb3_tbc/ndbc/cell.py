@@ -21,7 +21,7 @@ INITIAL_RANGES = {
     "gain": (2.0, 4.0),
     "input_conductance": (0.5, 1.0),
 }
-"""Initial values are uniform in these."""
+"""Ranges from which initial values are drawn uniformly."""
 
 
 class Cell(Protocol):
@@ -259,10 +259,10 @@ class ConductanceCell(nn.Module):
         )
 
     def excitation(self, arrays: ConductanceArrays) -> tuple[th.Tensor, th.Tensor]:
-        """Weights ``(n_inputs, S + M)`` and shifts ``(S + M,)`` whose tanh is all that inputs do.
+        """Weights W ``(n_inputs, S + M)`` and shifts b ``(S + M,)``: inputs u act through ``tanh(u W + b)`` alone.
 
-        The logistic of sensory neurons is ``(1 + tanh(x / 2)) / 2``: here x is halved, and who uses this halves the
-        sensory rows of ``from_inputs`` and adds half of their sum to ``rest``.
+        The logistic of sensory neurons is ``(1 + tanh(x / 2)) / 2``. W and b hold x / 2; callers halve the sensory rows
+        of ``from_inputs`` and add half of their sum to ``rest``.
         """
         weight = th.cat((th.diag(0.5 * arrays.sensory_gain), arrays.current_weight), dim=1)
         return weight, th.cat((-0.5 * self.sensory_threshold, self.current_bias))

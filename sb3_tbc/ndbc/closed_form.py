@@ -155,7 +155,7 @@ class ClosedFormNDBC:
         return push
 
     def span(self, state: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The interval the exact potentials cannot leave from ``state`` on, lower and upper bounds ``(batch, N)``."""
+        """The interval that exact potentials starting from ``state`` never leave: two bounds, ``(batch, N)`` each."""
         low, high = (bound.cpu().numpy().astype(self.dtype) for bound in self.cell.bounds(np.inf, -np.inf))
         return np.minimum(low, state), np.maximum(high, state)
 

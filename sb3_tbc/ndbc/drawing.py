@@ -1,7 +1,7 @@
 """A wiring as a picture: layers from left to right, excitatory synapses red, inhibitory blue. Needs matplotlib.
 
-What cannot act on any output is drawn hollow: a dead end. With weights of a readout, outputs are a fifth column; with
-currents of a trained agent, synapses are as thick and as dark as they are used.
+Neurons that cannot act on any output (dead ends) are drawn hollow. With weights of a readout, outputs are a fifth
+column. With currents of a trained agent, the more a synapse is used, the thicker and darker it is.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ def draw_wiring(
     :param wiring: the wiring
     :param ax: matplotlib axes to draw into; new ones by default
     :param input_names: a name per sensory neuron
-    :param readout: weight of each neuron on each output, ``(n_neurons, n_outputs)``; without it the motor neurons count
-        as what is read
+    :param readout: weight of each neuron on each output, ``(n_neurons, n_outputs)``; without it the motor neurons are
+        those that are read
     :param output_names: a name per output
     :param used: mean size of the current through each synapse, from sensory neurons ``(n_inputs, n_neurons)`` and among
         neurons ``(n_neurons, n_neurons)``; all synapses look alike without it
@@ -78,7 +78,7 @@ def draw_wiring(
 def dead_ends(wiring: NDBCWiring, readout: FloatArray | None = None) -> tuple[BoolArray, BoolArray]:
     """Sensory neurons ``(n_inputs,)`` and neurons ``(n_neurons,)`` that cannot act on any output.
 
-    :param readout: weights ``(n_neurons, n_outputs)``; without them the motor neurons are what is read
+    :param readout: weights ``(n_neurons, n_outputs)``; without them the motor neurons are those that are read
     """
     acts = np.zeros(wiring.n_neurons, dtype=bool)
     if readout is None:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 DYNAMICS = ("conductance", "dissipative")
 SYNAPSES = ("paper", "lean")
 STEP_STATE, STEP_DIRECTION = "step_state", "step_direction"
-"""Entries of the state where K follows a step-size rule."""
+"""Further entries of the saved state, if K follows a step-size rule."""
 
 
 class NDBCNet(nn.Module):
@@ -51,7 +51,7 @@ class NDBCNet(nn.Module):
         :class:`~sb3_tbc.ndbc.lean.LeanCell`; conductance dynamics only
     :param time_constants: range of each layer's initial time constants in control steps, drawn log-uniformly, e.g.
         ``{"command": (0.5, 3.0)}``; layers left out, and all by default, start at .1 to .3 and so forget within a
-        step. Neurons as slow as one likes need no more sub-steps. Conductance dynamics only
+        step. Slow neurons need no more sub-steps than fast ones. Conductance dynamics only
     :param initial_gains: range of the initial gains of all logistics, by default 2 to 4; conductance dynamics only
     :raises ValueError: if sizes do not fit together or an option is unknown
 
@@ -192,7 +192,7 @@ class NDBCNet(nn.Module):
     def _unroll_fast(
         self, inputs: th.Tensor, state: th.Tensor | None, mask: th.Tensor | None, interval: th.Tensor | None
     ) -> Unrolled | None:
-        """A sequence through the node of its own; None for what that cannot do."""
+        """A sequence through :class:`.UnrolledCell`; None if that does not support the case."""
         self._check_shapes(inputs, state, mask, interval, dims=3)
         checked = self.step_rule is not None and self.step_rule.half_step_check
         if not isinstance(self.cell, ConductanceCell) or interval is not None or checked or inputs.shape[1] == 0:
@@ -334,7 +334,7 @@ class NDBCNet(nn.Module):
 
 
 def _after_loading(net: NDBCNet, _: object) -> None:
-    """Once all weights are there: K and its companions as they were saved."""
+    """Restore K, and what the step-size rule remembers, after all weights are loaded."""
     if net.step_rule is None:
         return
     if net._restore_step is None:  # saved by a version that did not keep K
@@ -363,7 +363,7 @@ def _check_options(
         if value not in allowed:
             raise ValueError(f"{name} must be one of {allowed}, got {value!r}")
     if max_rho is not None and dynamics != "dissipative":
-        raise ValueError("max_rho belongs to dynamics='dissipative'; conductance dynamics are bounded as they are")
+        raise ValueError("max_rho belongs to dynamics='dissipative'; conductance dynamics are bounded without it")
     given = {name: value for name, value in only_conductance.items() if value is not None}
     given |= {"synapses": synapses} if synapses != "paper" else {}
     if given and dynamics != "conductance":
@@ -372,7 +372,7 @@ def _check_options(
 
 
 def _check_intervals(interval: th.Tensor) -> None:
-    """Refuse lengths that are negative or NaN; a graph under construction cannot look at values and takes them."""
+    """Refuse lengths that are negative or NaN; while a graph is traced there are no values to check."""
     if th.compiler.is_compiling():
         return
     if not bool((interval >= 0).all()):

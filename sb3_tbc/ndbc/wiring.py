@@ -44,7 +44,7 @@ class NDBCWiring:
     """
 
     drawer: ClassVar[Callable[..., Axes] | None] = None
-    """What :meth:`draw` calls; set where the package is put together, since drawing builds upon wirings."""
+    """The function that :meth:`draw` calls; set in the package's ``__init__``, as its module imports this one."""
 
     def __init__(
         self,
@@ -146,12 +146,12 @@ class NDBCWiring:
         """Groups of neurons, each of which hears only neurons of earlier groups, as far as there is no loop.
 
         The closed form (paper, section 4.3) takes the neurons in this order, so that a signal passes from sensory to
-        motor neurons within one control step. A loop is opened at the one of its neurons that hears the fewest of those
-        still to come.
+        motor neurons within one control step. A loop is opened at the neuron that hears the fewest neurons not yet
+        placed.
         """
-        # Transitive closure (Warshall): two neurons that reach each other are in one loop. In every round those go
-        # that hear nobody who still waits upstream of their loop; within a loop, where everybody hears somebody
-        # waiting, the one with the fewest such voices goes first and hears them as they were.
+        # Transitive closure (Warshall): two neurons that reach each other are in one loop. A neuron is free once all
+        # neurons upstream of its loop are placed. Each round places the free neurons that hear no waiting neuron; if
+        # there are none (a loop), the free neuron that hears the fewest of them, as they were before the step.
         heard = self.recurrent != 0
         np.fill_diagonal(heard, False)
         before = heard.copy()  # whether a path leads from one neuron to the other

@@ -51,7 +51,7 @@ def check_goal_space(observation: Space, action: Space | None = None) -> spaces.
     problems = goal_space_problems(observation, action)
     if problems or not isinstance(observation, spaces.Dict):
         raise ValueError(
-            "a hierarchical agent needs a goal environment with continuous actions, and this is none: "
+            "a hierarchical agent needs a goal environment with continuous actions, and this is not one: "
             f"{'; '.join(problems)}. Derive it from gymnasium_robotics.core.GoalEnv."
         )
     return observation

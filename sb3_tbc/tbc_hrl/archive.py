@@ -91,7 +91,7 @@ def _check_members(archive: zipfile.ZipFile, size: int, name: str) -> None:
 def _check_weights(content: bytes, name: str) -> None:
     """Look into a file of weights, itself a ``.zip``, for one that would unpack to far more than its size."""
     if not zipfile.is_zipfile(io.BytesIO(content)):
-        return  # torch refuses what is none
+        return  # not a zip: torch refuses it
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         if sum(member.file_size for member in archive.infolist()) > MAX_GROWTH * len(content) + SMALL:
             raise ConfigError(f"{name} would unpack to far more than its {len(content)} bytes; no agent does")

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from numbers import Real
+from numbers import Integral, Real
+from typing import Any
 
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 
-def whole_steps(total_timesteps: object) -> int:
+def whole_steps(total_timesteps: Any) -> int:
     """The number of environment steps to learn for.
 
     :raises TypeError: if it is not a whole number
     :raises ValueError: if it is negative
     """
-    number = total_timesteps if isinstance(total_timesteps, Real) and not isinstance(total_timesteps, bool) else None
-    if number is None or number != number or number % 1 != 0:
+    number = isinstance(total_timesteps, (Integral, Real)) and not isinstance(total_timesteps, bool)
+    if not number or total_timesteps != total_timesteps or total_timesteps % 1 != 0:
         raise TypeError(f"total_timesteps must be a whole number of environment steps, got {total_timesteps!r}")
-    if number < 0:
+    if total_timesteps < 0:
         raise ValueError(f"total_timesteps must not be negative, got {total_timesteps}")
-    return int(math.trunc(number))
+    return int(total_timesteps)
 
 
 def refuse_vec_normalize(env: VecEnv) -> None:

@@ -35,7 +35,7 @@ class LiveSettings(PlainMapping):
     def __setitem__(self, key: str, value: object) -> None:
         """Change a setting of the agent.
 
-        :raises SettingError: if it is none that can change, or the value is not allowed
+        :raises SettingError: if it cannot be changed, or the value is not allowed
         """
         if key not in CHANGEABLE:
             raise SettingError(

@@ -1,4 +1,4 @@
-"""What a run needs besides weights and replay to go on, bit for bit, as if it had never been interrupted."""
+"""The state of a run besides weights and replay, so that it can be continued bit for bit after an interruption."""
 
 from __future__ import annotations
 

@@ -280,7 +280,7 @@ def test_rewards_that_contradict_themselves_are_refused():
     for kind, message in (
         (Better, "away from a goal, but only"),
         (Always, "for every observed pair of goals"),
-        (Claims, "its info says otherwise than its reward"),
+        (Claims, "its info contradicts its reward"),
         (Raised, "not the same everywhere"),
     ):
         with pytest.raises(ValueError, match=f"{kind.__name__} cannot be used .*{message}"):
