@@ -7,8 +7,10 @@ import runpy
 import sys
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 import pytest
+import sb3_tbc.tasks
 
 from sb3_tbc import __main__, evaluate, train
 from sb3_tbc.benchmark import command as benchmark
@@ -16,6 +18,9 @@ from sb3_tbc.commands import COMMANDS, Parser
 from sb3_tbc.export import command as export
 from sb3_tbc.extras import MissingExtraError, require
 from sb3_tbc.ndbc.wiring import NDBCWiring
+from sb3_tbc.settings import Settings
+from sb3_tbc.settings.listing import entries
+from sb3_tbc.tbc_hrl.config import FlatConfig, TBCConfig
 from sb3_tbc.tune import command as tune
 
 RIDDLES = (
@@ -26,7 +31,16 @@ RIDDLES = (
     "brings along",
     "where there are such",
     "of which --config",
+    "without say",
+    "left all sense",
+    "there is no longer",
+    "lived through",
+    "near is near enough",
+    "stays owed",
+    "who is owed",
+    "none writes none",
 )
+"""Phrases that a newcomer has to read twice, kept out of help texts, docstrings and messages."""
 
 
 def parsers() -> dict[str, argparse.ArgumentParser]:
@@ -76,6 +90,19 @@ def test_every_option_says_what_it_is_for(name: str) -> None:
     for action in parsers()[name]._actions:
         assert action.help or isinstance(action, argparse._SubParsersAction), f"{name}: {action.dest}"
         assert not [riddle for riddle in RIDDLES if riddle in str(action.help)]
+
+
+@pytest.mark.parametrize("config", [TBCConfig, FlatConfig])
+def test_every_setting_is_explained_without_riddles(config: type[Settings]) -> None:
+    for entry in entries(config):
+        assert not [riddle for riddle in RIDDLES if riddle in entry.text], entry.name
+
+
+@pytest.mark.parametrize("package", [sb3_tbc, sb3_tbc.tasks])
+def test_sources_have_no_riddles(package: ModuleType) -> None:
+    for path in Path(str(package.__file__)).parent.rglob("*.py"):
+        text = " ".join(path.read_text(encoding="utf-8").split())
+        assert not [riddle for riddle in RIDDLES if riddle in text], path
 
 
 def test_defaults_are_said_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -34,7 +34,7 @@ from sb3_tbc.tbc_hrl.calls import refuse_level_setting, refuse_vec_normalize, wh
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, ProgressBar, described, progress_bar_of, record_progress
-from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, mismatch_explained, reward_range
+from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, reward_range
 from sb3_tbc.tbc_hrl.foreign_high import put_together
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
@@ -44,7 +44,6 @@ from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY
 from sb3_tbc.tbc_hrl.two_level_saving import TwoLevelSaving
 
 SelfTBCHRL = TypeVar("SelfTBCHRL", bound="TBCHRL")
-
 
 MIN_UPDATES_TO_COMPILE = 3000
 """With ``compile="auto"`` fewer updates than this run eagerly: compiling costs about as much as they do."""
@@ -407,17 +406,6 @@ class TBCHRL(TwoLevelSaving):
     # ------------------------------------------------------------------ saving
 
     @classmethod
-    def load(cls: type[SelfTBCHRL], *args: Any, **kwargs: Any) -> SelfTBCHRL:
-        """Load an agent, see SB3; ``device="auto"`` is the CPU, where both levels act and learn.
-
-        :raises ValueError: if the environment given does not fit, naming the layout that does
-        """
-        if len(args) < 3 and kwargs.get("device", "auto") == "auto":  # the third argument is the device
-            kwargs["device"] = "cpu"
-        with mismatch_explained():
-            return super().load(*args, **kwargs)
-
-    @classmethod
     def from_levels(cls, high: BaseAlgorithm, low: TBCHRL) -> TBCHRL:
         """An agent whose high level is another algorithm's policy, for ``predict``, evaluation and export.
 
@@ -429,18 +417,3 @@ class TBCHRL(TwoLevelSaving):
         :raises ValueError: if the two do not fit
         """
         return put_together(high, low)
-
-    def save(self, *args: Any, **kwargs: Any) -> None:
-        """Save the agent, see SB3.
-
-        :raises ValueError: for an agent from :meth:`from_levels`
-        """
-        self._refuse_foreign_high("save")
-        super().save(*args, **kwargs)
-
-    def _refuse_foreign_high(self, what: str) -> None:
-        if self.foreign_high is not None:
-            raise ValueError(
-                f"an agent from from_levels cannot {what}: its high level is a {type(self.foreign_high).__name__}. "
-                f"Use high.{what}(...) and low.{what}(...), then from_levels again"
-            )

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import io
 import pathlib
+from collections.abc import Iterable
+from typing import Any, TypeVar
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.type_aliases import TensorDict
+from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import Arrays
@@ -18,9 +20,12 @@ from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
+from sb3_tbc.tbc_hrl.environment import mismatch_explained
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import Reachability
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
+
+SelfTwoLevel = TypeVar("SelfTwoLevel", bound="TwoLevelSaving")
 
 
 class TwoLevelSaving(PlainAlgorithm):
@@ -96,3 +101,43 @@ class TwoLevelSaving(PlainAlgorithm):
             high, low = map(LevelSpaces.of_level, (self.high, self.low))
             self._make_replay(high, low, *self.rng.integers(2**31, size=2).tolist())
         self._resumed = self.replay_buffer.load(path)
+
+    @classmethod
+    def load(
+        cls: type[SelfTwoLevel],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: Plain | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        trust: bool = False,
+        **kwargs: Any,
+    ) -> SelfTwoLevel:
+        """Load an agent, see SB3; ``device="auto"`` is the CPU, where both levels act and learn.
+
+        :raises ValueError: if the environment given does not fit, naming the layout that does
+        """
+        device = "cpu" if device == "auto" else device
+        with mismatch_explained():
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, trust, **kwargs)
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Save the agent, see SB3.
+
+        :raises ValueError: for an agent from :meth:`from_levels`
+        """
+        self._refuse_foreign_high("save")
+        super().save(path, exclude, include)
+
+    def _refuse_foreign_high(self, what: str) -> None:
+        if self.foreign_high is not None:
+            raise ValueError(
+                f"an agent from from_levels cannot {what}: its high level is a {type(self.foreign_high).__name__}. "
+                f"Use high.{what}(...) and low.{what}(...), then from_levels again"
+            )
