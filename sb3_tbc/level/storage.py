@@ -63,7 +63,7 @@ class FlatParameters:
         return True
 
     def sync(self) -> None:
-        """Take over the modules' values if they no longer share the vector's memory, and share it again."""
+        """Copy the modules' values if they no longer share the vector's memory, and share it again."""
         if not self.is_aliased():
             self.vector.data.copy_(th.cat([p.detach().flatten() for p in self._parameters]))
             self.alias()

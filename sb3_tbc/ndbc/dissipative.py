@@ -41,9 +41,8 @@ class Certificate(NamedTuple):
 class DissipativeCell(nn.Module):
     """``x' = (I + eta K)^-1 [x + eta tanh(W u + U x + b)]`` on the same wiring, diagonal K > 0 (equation 20).
 
-    The bracket around both terms is what the contraction factor of equation 21,
-    ``rho = ||(I + eta K)^-1|| (1 + eta L ||U||)`` with L = 1 for tanh, belongs to.
-    Weights carry their synapse's polarity.
+    The contraction factor of equation 21, ``rho = ||(I + eta K)^-1|| (1 + eta L ||U||)`` with L = 1 for tanh, holds for
+    this form, with the bracket around both terms. Weights carry their synapse's polarity.
 
     :param wiring: who is wired to whom, with polarities
     :param generator: source of the initial values; torch's global one if None

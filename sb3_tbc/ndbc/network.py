@@ -248,7 +248,7 @@ class NDBCNet(nn.Module):
             destination[prefix + STEP_DIRECTION] = self.lipschitz.direction.clone()
 
     def _load_from_state_dict(self, state_dict: Plain, prefix: str, *args: object) -> None:
-        """Take over weights and K.
+        """Load weights and K.
 
         The index tables of the cell are part of the state, so weights of another wiring are recognised and refused:
         they would act through its synapses while ``net.wiring`` still described the present ones.

@@ -106,7 +106,7 @@ class RingBuffer(BaseBuffer):
         return {**held, "pos": np.array(self.pos), "full": np.array(self.full)}
 
     def set_state(self, state: Mapping[str, AnyArray]) -> None:
-        """Take over rows saved by :meth:`get_state`.
+        """Load rows saved by :meth:`get_state`.
 
         :raises ValueError: if they have other quantities or widths than this buffer
         """

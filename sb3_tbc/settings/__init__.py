@@ -6,7 +6,7 @@ A field is declared once, with its type, its default and a docstring below it::
     \"\"\"Discount per decision.\"\"\"
 
 Types may be ``bool, int, float, str``, a ``Literal``, a ``tuple``, a ``dict``, any class, another settings dataclass,
-and unions of these; numbers have to be finite. Nothing here knows which settings there are.
+and unions of these; numbers have to be finite. This folder knows no particular settings.
 """
 
 from sb3_tbc.settings.domains import Domain, Increasing, NotEmpty, Prefixed, Range

@@ -5,7 +5,7 @@ running away (arXiv 2312.05787). The bounds are those of an episode: a level has
 ``max_options`` decisions, the low level the steps of the longest time budget (HAC bounds its critics likewise). A state
 from which success is possible within them has a value within the bounds; hopeless ones end at the lower one.
 
-Soft actor-critic adds the policy's entropy to all values. Whoever acts uniformly has a positive entropy, so the best
+Soft actor-critic adds the policy's entropy to all values. A uniform policy has a positive entropy, so the best
 soft value is never below the lowest return; and it exceeds the highest one by no more than the temperature times the
 largest entropy of each later action, whose discounted number is :attr:`ValueBounds.later`.
 """

@@ -119,7 +119,7 @@ class Collector(TwoLevelRunner):
         return {**self.env.get_state(), "membrane": self.membrane, "observation": self.observation}
 
     def set_state(self, state: Mapping[str, AnyArray], observation: GoalObservation) -> bool:
-        """Take over what :meth:`get_state` gave; False if what the environments show does not belong to it.
+        """Restore what :meth:`get_state` gave; False if the environments' observations do not belong to it.
 
         :param observation: what the environments show now
         """

@@ -165,7 +165,7 @@ class FlatSAC(PlainAlgorithm, SAC):
         """Collect :data:`CYCLE` steps, then update in a burst, until ``total_timesteps`` steps are done.
 
         As with the two-level agents, several short calls learn what one long one does, and setting
-        :attr:`stop_requested` makes it return between two cycles' parts, never in the middle of a burst.
+        :attr:`stop_requested` makes it return before or after a burst of updates, never within one.
 
         :raises ValueError: without an environment, or if ``total_timesteps`` is negative
         :raises TypeError: if ``total_timesteps`` is not a whole number
@@ -221,9 +221,9 @@ class FlatSAC(PlainAlgorithm, SAC):
             self.train(updates, self.batch_size)
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """Write the replay buffer, and all else that learning goes on from, to one file of plain arrays.
+        """Write the replay buffer, and all else that is needed to continue learning, to one file of plain arrays.
 
-        A model saved at the same moment, loaded together with this file, goes on learning with
+        A model saved at the same moment and loaded together with this file continues with
         ``learn(..., reset_num_timesteps=False)`` as if it had never stopped, bit for bit.
         """
         buffer = self._her_buffer()
@@ -239,8 +239,8 @@ class FlatSAC(PlainAlgorithm, SAC):
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what :meth:`save_replay_buffer` wrote; only plain arrays are read, never pickled objects.
 
-        :param truncate_last_traj: close the episode that was running when the buffer was saved, if it cannot be gone
-            on with
+        :param truncate_last_traj: close the episode that was running when the buffer was saved, if it cannot be
+            continued
         :raises ValueError: if the file was written for other spaces or a larger buffer
         """
         if not isinstance(getattr(self, "replay_buffer", None), HerReplayBuffer) and self.env is not None:

@@ -20,7 +20,7 @@ LEVEL_NAMES = ("actor_learning_rate", "batch_size", "buffer_size", "ent_coef", "
 
 
 def check_top_names(given: PlainMapping) -> None:
-    """Refuse a setting of a level where none is named.
+    """Refuse a level's setting that is given for the whole agent.
 
     :raises SettingError: naming where it belongs
     """

@@ -242,7 +242,9 @@ WRITERS: tuple[tuple[type | tuple[type, ...], str, Callable[[Any], Any]], ...] =
     (FunctionType, "function", lambda value: {"name": _named(_function, value)}),
     (type, "class", lambda value: {"name": _named(_class, value)}),
 )
-"""Kinds of objects, the name each is written under (none: as itself), and how. The first that fits is taken."""
+"""Kinds of objects, the name under which each is written (empty: as JSON's own type), and the function that writes it.
+The first kind that fits is used.
+"""
 
 READERS: dict[str, Callable[..., object]] = {
     "number": _read_scalar,

@@ -48,7 +48,7 @@ class TwoLevelSaving(PlainAlgorithm):
         raise NotImplementedError
 
     def learning_state(self) -> Arrays:
-        """What learning goes on from besides weights and replay, as plain arrays: random streams, open options."""
+        """What is needed to continue learning besides weights and replay: random streams, open options, counters."""
         return resume.get_state(self._moving_parts())
 
     def _moving_parts(self) -> resume.LearningState:
@@ -84,9 +84,9 @@ class TwoLevelSaving(PlainAlgorithm):
             level.refresh()
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """Write both levels' replay buffers, and all else that learning goes on from, to one file of plain arrays.
+        """Write both levels' replay buffers, and all else that is needed to continue learning, to one file of arrays.
 
-        A model saved at the same moment (between two rollouts), loaded together with this file, goes on learning with
+        A model saved at the same moment (between two rollouts) and loaded together with this file continues with
         ``learn(..., reset_num_timesteps=False)`` as if it had never stopped, bit for bit.
         """
         self.replay_buffer.save(path, self.learning_state())
