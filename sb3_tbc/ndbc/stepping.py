@@ -18,8 +18,8 @@ class StepRule:
 
     Lengths are in control steps. With the default bounds K lies between 3, the number of synaptic hops, and 6.
 
-    :param eta: dimensionless scale
-    :param epsilon: keeps the quotient finite
+    :param eta: scale of the sub-step's length, without unit
+    :param epsilon: added to L, so that the quotient stays finite
     :param delta_min: smallest sub-step; ``1 / delta_min`` is K_max
     :param delta_max: largest sub-step
     :param refresh_every: updates between two evaluations of the Lipschitz proxy L

@@ -15,7 +15,7 @@ _NAMES: dict[object, str] = {
     int: "a whole number",
     float: "a number",
     str: "text",
-    type(None): "none",
+    type(None): "null",
 }
 
 

@@ -35,13 +35,13 @@ class SB3Arguments(Settings):
     stats_window_size: Annotated[int, Range(1)] = 100
     """Number of latest episodes that logged means are taken over."""
     tensorboard_log: str | os.PathLike[str] | None = None
-    """Folder for TensorBoard's files; none: no files are written."""
+    """Folder for TensorBoard's files; null: no files are written."""
     verbose: Annotated[int, Range(0, 2)] = 0
     """How much is printed: 0 nothing, 1 progress and notices, 2 everything."""
     device: str | th.device = "cpu"
     """Torch device: ``cpu``, ``cuda``, ``cuda:0``, ..., or ``auto``."""
     seed: Annotated[int, Range(0, 2**32 - 1)] | None = None
-    """Seed of networks, sampling and environments; none: a new one for each agent."""
+    """Seed of networks, sampling and environments; null: a new one for each agent."""
     _init_setup_model: bool = True
     """Whether to build the networks now."""
 

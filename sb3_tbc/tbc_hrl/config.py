@@ -75,9 +75,9 @@ class AgentConfig(Settings):
     """Who sets the time budget. ``joint``: the high level, together with the subgoal. ``rule``: the rule of equation 1,
     ``clip(kappa * H_reach, dt_min, dt_max)``. ``fixed``: nobody, it is always ``fixed_duration``."""
     fixed_duration: Positive | None = None
-    """Constant time budget for ``duration: fixed``, environment steps; none: ``dt_max``."""
+    """Constant time budget for ``duration: fixed``, environment steps; null: ``dt_max``."""
     kappa: Positive = 1.0
-    """Factor from the estimated steps to a subgoal to its time budget (equation 1, table A2)."""
+    """Factor by which the rule multiplies the estimated steps to a subgoal (equation 1, table A2)."""
     duration_loss_coef: Price = 0.0
     """Weight of the loss that draws the high level's time budget toward the rule's (section 4.2), in unit action
     coordinates; 0 leaves it out."""
@@ -100,12 +100,12 @@ class AgentConfig(Settings):
     deterministic_testing: bool = False
     """Whether the low level acts without noise in a test; the public HiTS does not."""
     testing_penalty: Annotated[float, Range(-1e6, 0)] | None = None
-    """Reward of a failed test; none: minus ``max_options``."""
+    """Reward of a failed test; null: minus ``max_options``."""
     keep_original: bool = False
     """Also learn from failed options as they were chosen, besides what hindsight makes of them (algorithm 1)."""
     relabel_tolerance: NotNegative | None = None
     """Largest distance, in unit coordinates, between where a failed option ended and the subgoal it is relabelled with
-    (the paper's success test: 0.05); none: all failed options are relabelled."""
+    (the paper's success test: 0.05); null: all failed options are relabelled."""
     random_fraction: Fraction = 0.05
     """Share of uniformly random actions on each level while exploring."""
     n_hindsight_goals: Annotated[int, Range(0, 1_000_000)] = 3
@@ -115,7 +115,7 @@ class AgentConfig(Settings):
     its options. ``event``: the option that the task's event ended."""
     goals_met: Literal["passing", "end"] = "passing"
     """What counts as meeting a hindsight goal. ``passing``: the window passes it, since the episode would have ended
-    there. ``end``: the window ends at it, as with ``target: decision`` in any case."""
+    there. ``end``: the window ends at it; with ``target: decision`` this is always used."""
     gradient_ratio: UpdateRatio = 1.0
     """Updates of each level per environment step, done in bursts after episodes."""
     learning_starts: Annotated[int, Range(0)] = 0
@@ -263,7 +263,7 @@ class FlatConfig(Settings):
     learning_rate: LearningRate = 3e-4
     """Learning rate of critics, actor and temperature; ``lin_<rate>`` falls linearly to zero at the end of training."""
     batch_size: Annotated[int, Range(1, 1_000_000)] = 256
-    """Transitions of each update."""
+    """Number of transitions in each update."""
     gamma: Fraction = 0.99
     """Discount per environment step."""
     tau: Annotated[float, Range(0, 1, above=True)] = 0.005
@@ -273,7 +273,7 @@ class FlatConfig(Settings):
     target_entropy: float | Literal["auto"] = "auto"
     """Entropy that an automatic temperature aims at; auto: minus the number of action dimensions."""
     buffer_size: Annotated[int, Range(1, 1_000_000_000)] = 1_000_000
-    """Transitions that the replay buffer holds."""
+    """Largest number of transitions in the replay buffer."""
     learning_starts: Annotated[int, Range(0)] = 100
     """Environment steps before the first update, in which actions are uniformly random."""
     gradient_ratio: UpdateRatio = 1.0

@@ -55,17 +55,17 @@ class PolicyConfig(Settings):
     net_arch: tuple[Width, ...] | NetArch = (64, 64)
     """Neurons of each hidden layer, for actor and critics alike, or ``pi`` and ``qf`` where they differ."""
     activation_fn: Literal["relu", "tanh", "silu", "elu"] | type[nn.Module] = "relu"
-    """Activation of the hidden layers, by name; in Python the torch class is taken as well."""
+    """Activation function of the hidden layers, by name; in Python also the torch class."""
     n_critics: Annotated[int, Range(1, 100)] = 2
     """Number of critics; the lowest of their values counts."""
     negative_critic: bool | None = None
-    """Keep the critics' values below zero (HiTS's force_negative), for rewards that are never positive; none: yes on
+    """Keep the critics' values below zero (HiTS's force_negative), for rewards that are never positive; null: yes on
     the high level unless ``completion_bonus`` is more than a decision costs, on the low level only with
     ``low_reward: step``."""
     mean_bound: Positive | None = 3.0
-    """The actor's mean is clamped to plus or minus this before squashing, as in HiTS; none: it is not clamped."""
+    """The actor's mean is clamped to plus or minus this before squashing, as in HiTS; null: it is not clamped."""
     log_std_bounds: Annotated[tuple[float, float], Increasing()] = (-6.9, 1.8)
-    """Bounds of the logarithm of the actor's standard deviation; the default is HiTS's 0.001 to 6."""
+    """Bounds of the logarithm of the actor's standard deviation; the default allows 0.001 to 6, as in HiTS."""
 
     def __post_init__(self) -> None:
         """Name the activation function, so that settings stay plain data."""
@@ -87,11 +87,11 @@ class TimeConstants(Settings):
     """Initial time constants of each layer of the circuit, in control steps, drawn evenly on a logarithmic scale."""
 
     inter: PositiveRange | None = None
-    """Of inter neurons; none: about 0.1 to 0.3, which forget within a control step."""
+    """Range of the inter neurons' time constants; null: about 0.1 to 0.3, so that they forget within a control step."""
     command: PositiveRange | None = None
-    """Of command neurons; none: about 0.1 to 0.3."""
+    """Range of the command neurons' time constants; null: about 0.1 to 0.3."""
     motor: PositiveRange | None = None
-    """Of motor neurons; none: about 0.1 to 0.3."""
+    """Range of the motor neurons' time constants; null: about 0.1 to 0.3."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,40 +99,42 @@ class CircuitConfig(Settings):
     """NDBCNet, the low level's actor: who is wired to whom (table A1), and how potentials move (section 4.3)."""
 
     inter: Neurons = 8
-    """Inter neurons."""
+    """Number of inter neurons."""
     command: Neurons = 6
-    """Command neurons."""
+    """Number of command neurons."""
     motor: Neurons | None = None
-    """Motor neurons; none: one for each dimension of the action."""
+    """Number of motor neurons; null: one for each dimension of the action."""
     sensory_fanout: Fan = 4
-    """Inter neurons that each sensory neuron projects to; at most all of them."""
+    """Number of inter neurons that each sensory neuron projects to; at most all of them."""
     inter_fanout: Fan = 5
-    """Command neurons that each inter neuron projects to."""
+    """Number of command neurons that each inter neuron projects to."""
     recurrent_command_synapses: Annotated[int, Range(0, 1_000_000)] = 3
-    """Synapses among the command neurons, in all."""
+    """Number of synapses among the command neurons, in all."""
     motor_fanin: Fan = 5
-    """Command neurons that each motor neuron listens to."""
+    """Number of command neurons that each motor neuron listens to."""
     seed: Annotated[int, Range(0, 2**32 - 1)] = 0
     """Seed of the wiring."""
     sub_steps: Annotated[int, Range(1, MOST_SUB_STEPS)] = 3
-    """Sub-steps of each control step, K; three synapses lie between sensory and motor neurons."""
+    """Number of sub-steps in a control step, K; three let a signal pass from sensory to motor neurons."""
     dynamics: Literal["conductance", "dissipative"] = "conductance"
-    """Neuron model: membrane potentials with conductances, or the dissipative cell of equations 20 and 21."""
+    """Neuron model. ``conductance``: membrane potentials with conductances. ``dissipative``: the cell of equations 20
+    and 21."""
     synapses: Literal["paper", "lean"] = "paper"
     """Synapse model. ``paper``: a conductance and a reversal potential for each synapse. ``lean``: one parameter for
     each synapse, and inputs act through the input current alone."""
     sensory_to: tuple[Literal["inter", "command", "motor"], ...] = ("inter",)
-    """Layers that sensory neurons project to; a second and third one add reflexes, which skip layers."""
+    """Layers that sensory neurons project to, ``inter`` first; further ones add reflexes, which skip layers."""
     time_constants: TimeConstants | None = None
-    """Ranges of the initial time constants, for circuits that are to remember; none: all neurons are fast."""
+    """Initial time constants of each layer, for circuits that are to remember; null: all neurons are fast."""
     initial_gains: PositiveRange | None = None
-    """Range of the initial gains of all logistics; none: 2 to 4."""
+    """Range of the initial gains (steepness) of the neurons' logistic functions; null: 2 to 4."""
     input_scale: tuple[Positive, ...] | None = None
-    """Fixed scales that inputs are divided by, one for each; none: those of the task."""
+    """Fixed scales that inputs are divided by, one for each; null: those of the task."""
     readout: Literal["all", "motor"] = "all"
-    """Neurons that actions are read from: all of them, as in the paper's equation, or the motor neurons."""
+    """Neurons that actions are read from. ``all``: all of them, as in the paper's equation. ``motor``: the motor
+    neurons."""
     max_rho: Annotated[float, Range(0, 1, above=True)] | None = None
-    """Largest contraction factor of the dissipative cell, enforced during training; none: no limit."""
+    """Largest contraction factor of the dissipative cell, enforced during training; null: no limit."""
     adaptive_step: bool | StepRule = False
     """Choose the number of sub-steps by the step-size rule (equation 17): true, or a section with its settings."""
 
@@ -172,15 +174,15 @@ class LevelConfig(Settings):
     learning_rate: LearningRate = 2e-3
     """Learning rate of critics, actor and temperature; ``lin_<rate>`` falls linearly to zero at the end of training."""
     actor_learning_rate: LearningRate | None = None
-    """Learning rate of the actor; none: ``learning_rate``. Circuits need larger ones than critics."""
+    """Learning rate of the actor; null: ``learning_rate``. Circuits need larger ones than critics."""
     ent_coef_learning_rate: Positive | None = None
-    """Learning rate of the automatic temperature; none: ``learning_rate``."""
+    """Learning rate of the automatic temperature; null: ``learning_rate``."""
     average_decay: Annotated[float, Range(0, 1, below=True)] = AVERAGE_DECAY
     """Decay per update of the averaged actor, which acts where deterministic actions are asked for; 0: no average."""
     batch_size: Annotated[int, Range(1, 1_000_000)] = 256
-    """Transitions of each update."""
+    """Number of transitions in each update."""
     gradient_ratio: UpdateRatio | None = None
-    """Updates of this level per environment step; none: the agent's ``gradient_ratio``."""
+    """Updates of this level per environment step; null: the agent's ``gradient_ratio``."""
     gamma: Fraction = 0.99
     """Discount: of the high level per decision, of the low level per environment step."""
     tau: Annotated[float, Range(0, 1, above=True)] = 0.0125
@@ -190,16 +192,17 @@ class LevelConfig(Settings):
     target_entropy: float | Literal["auto"] = "auto"
     """Entropy that an automatic temperature aims at; auto: minus the number of action dimensions."""
     buffer_size: Annotated[int, Range(1, 1_000_000_000)] = 1_000_000
-    """Transitions that the replay buffer holds."""
+    """Largest number of transitions in the replay buffer."""
     target_bounds: Literal["auto", "none"] | Annotated[tuple[float, float], Increasing()] = "none"
-    """Clip the critics' targets: ``auto`` to the lowest and highest return that rewards, penalties and discount allow,
-    with room for the temperature's share above; ``[low, high]`` to these; ``none`` not at all."""
+    """How the critics' targets are clipped. ``auto``: to the lowest and highest return that rewards, penalties and
+    discount allow, with room for the temperature's share above. ``[low, high]``: to these. ``none``: not at all."""
     critic_norm: Literal["none", "layer", "batch"] = "none"
-    """Normalise the critics' layers: ``layer`` normalisation, or ``batch`` normalisation without target networks
-    (CrossQ)."""
+    """Normalisation of the critics' layers. ``none``: no normalisation. ``layer``: layer normalisation. ``batch``:
+    batch normalisation without target networks (CrossQ)."""
     actor_q: Literal["min", "mean", "max"] | Fraction = "min"
-    """Which value of the critics the actor climbs: the smallest as in SAC, the mean, the largest, or a number between 0
-    (smallest) and 1 (largest); small actors learn less from a pessimistic one."""
+    """Which of the critics' values the actor maximises. ``min``: the smallest, as in SAC. ``mean``: their mean.
+    ``max``: the largest. A number: between the smallest (0) and the largest (1). Small actors learn less from the
+    smallest."""
     policy_kwargs: PolicyConfig = PolicyConfig()
     """Networks of the level."""
 
@@ -211,7 +214,8 @@ class HighConfig(LevelConfig):
     learning_rate: LearningRate = 3e-3
     """Learning rate of critics, actor and temperature; ``lin_<rate>`` falls linearly to zero at the end of training."""
     ent_coef: Temperature = 1.0
-    """Temperature, as on the low level; the default, the size of a decision's price, keeps the level exploring."""
+    """Temperature: a fixed one, ``auto``, or ``auto_<number>`` that starts there. The default, as large as the price of
+    a decision, keeps the level exploring."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -219,8 +223,8 @@ class LowConfig(LevelConfig):
     """The low level, which executes subgoals."""
 
     n_hindsight_goals: Annotated[float, Range(0, 1e6)] | None = None
-    """Number of hindsight subgoals for each transition, may be fractional; none: the agent's ``n_hindsight_goals``."""
+    """Number of hindsight subgoals for each transition, may be fractional; null: the agent's ``n_hindsight_goals``."""
     goal_strategy: Literal["future", "episode"] | None = None
-    """Where hindsight subgoals come from; none: as the agent's ``goal_strategy``. For ``low_reward: step`` only."""
+    """Where hindsight subgoals come from; null: as the agent's ``goal_strategy``. For ``low_reward: step`` only."""
     policy_kwargs: LowPolicyConfig = LowPolicyConfig()
     """Networks of the level; the circuit among them."""

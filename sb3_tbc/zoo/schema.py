@@ -52,9 +52,9 @@ class RunKeys(Settings):
     env_kwargs: Plain = field(default_factory=dict)
     """Arguments of ``gymnasium.make``."""
     policy: Literal["MultiInputPolicy"] = "MultiInputPolicy"
-    """Policy class; there is this one."""
+    """Policy class; there is only this one."""
     subgoals: SubgoalKeys | None = None
-    """Subgoals of an environment that does not bring its own."""
+    """Subgoal space, for environments without one of their own."""
 
 
 RUN = ("n_timesteps", "n_envs", "env_kwargs")

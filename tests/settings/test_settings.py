@@ -243,7 +243,7 @@ def test_settings_of_a_level_belong_to_a_level(name: str) -> None:
         ({"device": "cuda"}, "needs a GPU, and torch finds none"),
         ({"seed": -1}, "seed must be a whole number from 0 to"),
         ({"verbose": 7}, "verbose must be a whole number from 0 to 2"),
-        ({"subgoals": [1.0]}, "subgoals must be a SubgoalSpace or none"),
+        ({"subgoals": [1.0]}, "subgoals must be a SubgoalSpace or null"),
     ],
 )
 def test_arguments_of_the_constructor(given: dict[str, Any], message: str) -> None:
@@ -324,7 +324,7 @@ def test_options_of_the_circuit_reach_it_from_the_command_line(name: str) -> Non
 def test_types_in_words() -> None:
     assert describe(Annotated[float, Range(0, 1, above=True)]) == "a number above 0 and at most 1"
     assert describe(Annotated[float, Range(1, also=(-1,))]) == "a number of at least 1 or -1"
-    assert describe(Literal["a", "b"] | None) == "one of 'a', 'b' or none"
+    assert describe(Literal["a", "b"] | None) == "one of 'a', 'b' or null"
     assert describe(Annotated[str, Prefixed("lin_", Range(0, above=True))]) == "'lin_<number above 0>'"
     assert describe(Annotated[tuple[float, float], Increasing()]) == "a list of 2 numbers in rising order"
 

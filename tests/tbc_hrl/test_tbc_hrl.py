@@ -353,7 +353,7 @@ def test_a_level_may_have_a_gradient_ratio_of_its_own() -> None:
     steps = model.num_timesteps
     assert 0.3 * steps < model.low._n_updates <= 0.5 * steps
     assert 0.04 * steps < model.high._n_updates <= 0.1 * steps
-    with pytest.raises(ValueError, match=r"high.gradient_ratio must be a number from 0 to 1,000 or none, got -1"):
+    with pytest.raises(ValueError, match=r"high.gradient_ratio must be a number from 0 to 1,000 or null, got -1"):
         make(high={"gradient_ratio": -1})
 
 

@@ -130,7 +130,7 @@ def test_a_task_keeps_its_own_subgoals() -> None:
     ("item", "message"),
     [
         ("subgoals.treshold:1", "unknown setting 'subgoals.treshold'; did you mean 'thresholds'"),
-        ("subgoals.low:1", r"subgoals.low must be a list .* or none, got 1"),
+        ("subgoals.low:1", r"subgoals.low must be a list .* or null, got 1"),
         ("subgoals.low:[a]", r"subgoals.low must be a list \(each entry a number\) .* got \['a'\]"),
         ("subgoals.high:[.inf]", r"subgoals.high must be a list .* got \[inf\]"),
         ("subgoals.high:[]", r"subgoals.high must be a list .* got \[\]"),
