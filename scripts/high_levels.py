@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--algorithms", nargs="+", choices=sorted(ALGORITHMS), default=["SAC", "TQC", "CrossQ"])
     parser.add_argument("--options", type=int, default=3000, help="options to learn from (default: %(default)s)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of the high levels (default: 0)")
-    parser.add_argument("--trust", action="store_true", help="let the agent's file run code that it brings along")
+    parser.add_argument("--trust", action="store_true", help="load the agent even if its file can run code")
     args = parser.parse_args()
     th.set_num_threads(1)
     info, agent = identify(args.model, None), load_two_levels(args.model, trust=args.trust)

@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the episode (default: %(default)s)")
     parser.add_argument("--megabytes", type=float, default=3.0, help="largest size (default: %(default)s)")
     parser.add_argument("--frames", type=int, default=400, help="most frames (default: %(default)s)")
-    parser.add_argument("--trust", action="store_true", help="let the agent's file run code that it brings along")
+    parser.add_argument("--trust", action="store_true", help="load the agent even if its file can run code")
     args = parser.parse_args()
     kind = args.output.suffix.removeprefix(".")
     if kind not in ("webp", "gif"):

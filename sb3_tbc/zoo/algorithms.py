@@ -136,7 +136,7 @@ def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu", trust
     :param path: the ``.zip``
     :param env: environments to act in; an agent that needs some to be loaded gets those it was trained on
     :param device: torch device
-    :param trust: whether code that the file brings along may run, see :meth:`.PlainAlgorithm.load`
+    :param trust: whether code from the file may run, see :meth:`.PlainAlgorithm.load`
     :raises UntrustedError: if it cannot be loaded without that
     :raises ConfigError: if it cannot be loaded
     """
