@@ -188,7 +188,7 @@ def test_number_like_strings_become_numbers(tmp_path: Path) -> None:
         ),
         ("T: {max_option: 1}", r"a\.yml, section T: unknown setting 'max_option'; did you mean 'max_options'"),
         ("T: {tuned: {dt_mim: 1}}", r"tuned: unknown setting 'dt_mim'; did you mean 'dt_min'"),
-        ("T: {window_end: soon}", r"window_end must be one of 'timed', 'reached', got 'soon'"),
+        ("T: {window_end: soon}", r"window_end must be one of 'timed', 'reached', 'reconsider', got 'soon'"),
         ("T: {low: {batch_size: 1.5}}", r"low.batch_size must be a whole number from 1 to 1,000,000, got 1\.5"),
         ("T: {low: {gamma: true}}", r"low.gamma must be a number from 0 to 1, got True"),
         ("T: {low: 3}", r"low must be a section"),
