@@ -54,6 +54,9 @@ def build_parser() -> Parser:
     what.add_argument("--ablation", help="leave a part out: no-ts (timed subgoals) or no-ndbc (the circuit)")
     what.add_argument("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, which win "
                       "over the configuration; dots lead into a level, e.g. low.learning_rate:1e-3")  # fmt: skip
+    what.add_argument("--on-bad-step", choices=["stop", "end-episode"], help="what follows where the environment "
+                      "gives a value that is not finite, or of a wrong shape: stop the run, saved (default), or end "
+                      "the episode with the step before; short for the setting on_bad_step")  # fmt: skip
     watch = parser.add_argument_group("how it is evaluated")
     watch.add_argument("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a "
                        "fortieth of the run, at least 500")  # fmt: skip
@@ -104,6 +107,7 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
     algorithm(args.algo)
     task, env_id = resolve_env(args.env)
     overrides = parse_overrides(args.hyperparams)
+    overrides |= {"on_bad_step": args.on_bad_step} if args.on_bad_step else {}
     config, file = config_and_file(args)
     run = load_config(args.algo, task, config, overrides, args.ablation, file)
     if args.ablation is not None:

@@ -15,12 +15,14 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
+from numpy.typing import ArrayLike
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_tbc.aliases import Env, Plain, Wrapper
+from sb3_tbc.aliases import Env, Plain, Space, Wrapper
 from sb3_tbc.arrays import Arrays, BoolArray, FloatArray
+from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.faults import fault
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
@@ -30,6 +32,9 @@ ANNOUNCE = "announce_last_window"
 
 BUDGET_EXHAUSTED = "budget_exhausted"
 """Key of ``info``: the episode ended with this step because the high level's decisions are used up."""
+
+BAD_STEP = "bad_step"
+"""Key of ``info``: what is wrong with what this step, or this reset, gave; the observation is not to be used then."""
 
 
 class LastWindow(NamedTuple):
@@ -74,7 +79,7 @@ class EpisodeLimit(Wrapper, RecordConstructorArgs):
         self.index = index
         self.task_space = space = env.observation_space
         self._parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
-        self._shapes = [(key, part.shape) for key, part in self._parts.items()]
+        self._shapes = shapes_of(space)
         self._last: LastWindow | None = None
         self._passed = self._steps = 0
 
@@ -89,21 +94,25 @@ class EpisodeLimit(Wrapper, RecordConstructorArgs):
             observation, info = self.env.reset(**kwargs)
         except Exception as error:  # a task's own code may fail in any way
             raise fault(self.index, self._steps, error) from error
-        self._check(observation, info)
-        return observation, info
+        wrong = self._wrong(observation, info)
+        return (observation, info) if wrong is None else (self._blank(), {BAD_STEP: wrong})
 
     def step(self, action: object) -> tuple[object, SupportsFloat, bool, bool, Plain]:
         """Step; the last observation of an episode is copied, as some environments reuse their arrays.
 
+        Where something is not as it was declared, nothing of the step is handed on: ``info`` says what was wrong, and
+        the agent's :class:`.Guard` decides what follows.
+
         :raises EnvironmentFault: if the task's own code fails, naming environment and step
-        :raises ValueError: if the observation is not of the shape that its space says
         """
         self._steps += 1
         try:
             observation, reward, terminated, truncated, info = self.env.step(action)
         except Exception as error:  # a task's own code may fail in any way
             raise fault(self.index, self._steps, error) from error
-        self._check(observation, info)
+        wrong = self._wrong(observation, info, reward)
+        if wrong is not None:
+            return self._blank(), 0.0, False, False, {BAD_STEP: wrong}
         if self._last is not None and not (terminated or truncated):
             self._passed += 1
             truncated = self._last.over(self._passed, self._as_declared(observation))
@@ -113,29 +122,55 @@ class EpisodeLimit(Wrapper, RecordConstructorArgs):
             observation = {key: np.array(part) for key, part in observation.items()}
         return observation, reward, terminated, truncated, info
 
-    def _check(self, observation: object, info: object) -> None:
-        if isinstance(info, dict) and isinstance(observation, dict):
-            for key, shape in self._shapes:
-                if getattr(observation.get(key), "shape", None) != shape:
-                    break
-            else:
-                return
-        for key, shape in self._shapes:
-            part = observation.get(key) if isinstance(observation, dict) else None
-            if part is None or np.shape(part) != shape:
-                got = "nothing" if part is None else f"shape {np.shape(part)}"
-                raise ValueError(
-                    f"environment {self.index}, step {self._steps} of its episode: observation[{key!r}] must have "
-                    f"shape {shape} as its space says, got {got}"
-                )
-        if not isinstance(info, dict):
-            raise ValueError(
-                f"environment {self.index}, step {self._steps} of its episode: info must be a dictionary, got {info!r}"
-            )
+    def _wrong(self, observation: object, info: object, reward: object = 0.0) -> str | None:
+        """What is not as it was declared; None if all is."""
+        found = wrong_shape(observation, self._shapes)
+        if found is None and not isinstance(info, dict):
+            found = f"info must be a dictionary, got {info!r}"
+        if found is None and not _is_number(reward):
+            found = f"its reward must be a number, got {one_line(repr(reward), 100)}"
+        return found
+
+    def _blank(self) -> Plain:
+        return {key: np.zeros(shape or (), self._parts[key].dtype) for key, shape in self._shapes}
 
     def _as_declared(self, observation: GoalObservation) -> GoalObservation:
         """The observation in the precision in which vectors of environments hand it on."""
         return {key: np.asarray(observation[key], dtype=self._parts[key].dtype) for key in GOAL_KEYS}
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float | int | np.floating | np.integer) or (
+        isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "fiub"
+    )
+
+
+def shapes_of(space: Space) -> Shapes:
+    """The parts of a goal environment's observation with their shapes; none of another space."""
+    return [(key, part.shape) for key, part in space.spaces.items()] if isinstance(space, spaces.Dict) else []
+
+
+def wrong_shape(observation: object, shapes: Shapes) -> str | None:
+    """What of an observation has another shape than its space says; None if nothing has.
+
+    :param shapes: names of its parts with their shapes
+    """
+    if isinstance(observation, dict) and all(getattr(observation.get(k), "shape", None) == s for k, s in shapes):
+        return None
+    for key, shape in shapes:
+        part = observation.get(key) if isinstance(observation, dict) else None
+        if part is None or _shape(part) != shape:
+            got = "nothing" if part is None else f"shape {_shape(part)}"
+            return f"observation[{key!r}] must have shape {shape} as its space says, got {got}"
+    return None
+
+
+def _shape(part: ArrayLike) -> tuple[int, ...] | None:
+    """Shape of an array or nested list; None for one that has none."""
+    try:
+        return np.shape(part)
+    except ValueError:
+        return None
 
 
 class CopyableVecEnvWrapper(VecEnvWrapper):
@@ -162,6 +197,7 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         self._returns = np.zeros(venv.num_envs)
         self._lengths = np.zeros(venv.num_envs, dtype=np.int64)
         self._began = time.time()
+        self._shapes = shapes_of(venv.observation_space)
 
     def has_attr(self, attr_name: str) -> bool:
         """Whether the environments have an attribute."""
@@ -171,6 +207,9 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: object
     ) -> list[object]:
         """Call a method of the environments; announcements end here."""
+        if method_name == "reset":
+            for index in self._get_indices(indices):
+                self._forget(index)
         if method_name != ANNOUNCE:
             return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
         for index in self._get_indices(indices):
@@ -181,11 +220,16 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         """Begin an episode everywhere."""
         self._last.clear()
         self._returns[:], self._lengths[:] = 0.0, 0
-        return self.venv.reset()
+        if not isinstance(self.venv, SubprocVecEnv):
+            return self.venv.reset()
+        return reset_checked(self.venv, self._shapes)
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step; end the episodes whose last window is over."""
-        observation, rewards, dones, infos = self.venv.step_wait()
+        there = isinstance(self.venv, SubprocVecEnv)
+        observation, rewards, dones, infos = (
+            receive_checked(self.venv, self._shapes) if there else self.venv.step_wait()  # type: ignore[arg-type]
+        )
         self._returns += rewards
         self._lengths += 1
         for index, window in list(self._last.items()):
@@ -194,9 +238,12 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
             if not dones[index] and window.over(int(self._passed[index]), seen):
                 self._end(index, observation, dones, infos[index])  # type: ignore[arg-type]
         for ended in np.flatnonzero(dones):
-            self._last.pop(int(ended), None)
-            self._returns[ended], self._lengths[ended] = 0.0, 0
+            self._forget(int(ended))
         return observation, rewards, dones, infos
+
+    def _forget(self, index: int) -> None:
+        self._last.pop(index, None)
+        self._returns[index], self._lengths[index] = 0.0, 0
 
     def _end(self, index: int, observation: Arrays, dones: BoolArray, info: Plain) -> None:
         episode = {"r": float(self._returns[index]), "l": int(self._lengths[index]), "t": time.time() - self._began}
@@ -206,6 +253,52 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         for key, part in observation.items():
             part[index] = fresh[key]
         dones[index] = True
+
+
+def reset_checked(workers: SubprocVecEnv, shapes: Shapes) -> VecEnvObs:
+    """``SubprocVecEnv.reset``, but an observation of a wrong shape is told of in its ``reset_infos``."""
+    for remote, seed, options in zip(workers.remotes, workers._seeds, workers._options, strict=True):
+        remote.send(("reset", (seed, options)))
+    results = [remote.recv() for remote in workers.remotes]
+    checked = [_checked(observation, info, shapes) for observation, info in results]
+    workers.reset_infos = [info for _, info in checked]
+    workers._reset_seeds()
+    workers._reset_options()
+    return _stacked([observation for observation, _ in checked], workers)  # type: ignore[misc]
+
+
+def receive_checked(workers: SubprocVecEnv, shapes: Shapes) -> VecEnvStepReturn:
+    """``SubprocVecEnv.step_wait``, but an observation of a wrong shape is told of in ``info``."""
+    results = [remote.recv() for remote in workers.remotes]
+    workers.waiting = False
+    observations, rewards, dones, infos, reset_infos = (list(column) for column in zip(*results, strict=True))
+    for index, done in enumerate(dones):
+        if not done:
+            observations[index], infos[index] = _checked(observations[index], infos[index], shapes)
+            continue
+        last, infos[index] = _checked(infos[index]["terminal_observation"], infos[index], shapes)
+        infos[index]["terminal_observation"] = last
+        observations[index], reset_infos[index] = _checked(observations[index], reset_infos[index], shapes)
+    workers.reset_infos = reset_infos
+    return _stacked(observations, workers), np.stack(rewards), np.stack(dones), infos
+
+
+Shapes = list[tuple[str, tuple[int, ...] | None]]
+"""Names of the parts of an observation with their shapes."""
+
+
+def _checked(observation: VecEnvObs, info: Plain, shapes: Shapes) -> tuple[VecEnvObs, Plain]:
+    wrong = wrong_shape(observation, shapes)
+    if wrong is None:
+        return observation, info
+    return {key: np.zeros(shape or ()) for key, shape in shapes}, {BAD_STEP: wrong}
+
+
+def _stacked(observations: list[Plain], workers: SubprocVecEnv) -> VecEnvObs:
+    space = workers.observation_space
+    if not isinstance(space, spaces.Dict):
+        return np.stack(observations)  # type: ignore[arg-type]
+    return {key: np.stack([seen[key] for seen in observations]) for key in space.spaces}
 
 
 class MonitorOfLimit(Monitor):

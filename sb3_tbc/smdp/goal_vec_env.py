@@ -79,25 +79,29 @@ class GoalVecEnv(DummyVecEnv):
         """Step every environment and reset those whose episode is over."""
         infos: list[Plain] = []
         for index, env in enumerate(self.envs):
-            action = self.actions[index]
+            action, step = self.actions[index], len(self.running[index].actions) + 1
             try:
                 observation, self.buf_rews[index], terminated, truncated, given = env.step(action)
-            except Exception as error:
-                raise fault(index, len(self.running[index].actions) + 1, error) from error
-            self.running[index].actions.append(action)
-            info = {**given, "TimeLimit.truncated": truncated and not terminated}
-            over = self.buf_dones[index] = terminated or truncated
-            if over:
-                info["terminal_observation"] = observation
-                self._note_start(index, None)
-                try:
-                    observation, self.reset_infos[index] = env.reset()
-                except Exception as error:
-                    raise fault(index, 0, error) from error
-            for key, array in self.buf_obs.items():
-                array[index] = observation[key]
+                self.running[index].actions.append(action)
+                info = {**given, "TimeLimit.truncated": truncated and not terminated}
+                over = self.buf_dones[index] = terminated or truncated
+                if over:
+                    info["terminal_observation"] = observation
+                    observation = self._reset_one(index)
+                for key, array in self.buf_obs.items():
+                    array[index] = observation[key]
+            except Exception as error:  # a task's own code may fail in any way
+                raise fault(index, step, error) from error
             infos.append(info)
         return self._obs_from_buf(), self.buf_rews.copy(), self.buf_dones.copy(), infos  # type: ignore[return-value]
+
+    def _reset_one(self, index: int) -> GoalObservation:
+        self._note_start(index, None)
+        try:
+            observation, self.reset_infos[index] = self.envs[index].reset()
+        except Exception as error:  # a task's own code may fail in any way
+            raise fault(index, 0, error) from error
+        return observation  # type: ignore[no-any-return]
 
     def _obs_from_buf(self) -> GoalObservation:  # type: ignore[override]
         return {key: array.copy() for key, array in self.buf_obs.items()}

@@ -22,10 +22,10 @@ from sb3_tbc.smdp.episode_limit import (
     can_tell,
     with_episode_limit,
 )
-from sb3_tbc.smdp.faults import step_or_name
-from sb3_tbc.smdp.finite import all_finite, refusal
+from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, width
 from sb3_tbc.smdp.goal_test import EpisodeJudge
+from sb3_tbc.smdp.guard import Guard, OnBadStep
 from sb3_tbc.smdp.options import Episode, OptionClock, OptionRules, TerminationReason
 from sb3_tbc.smdp.recorder import EpisodeRecorder
 from sb3_tbc.smdp.spaces import GoalObservation
@@ -78,6 +78,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
     :param state_dim: width of the low level's memory to record with each step
     :param schedule: gives the time budgets where the high level does not
     :param gives_up: which windows the high level ends before their time; None: none of them
+    :param on_bad_step: what follows where an environment gives what is not finite, or of another shape: ``stop``, or
+        ``end-episode`` with the step before
     :raises ValueError: if the environments are not goal environments or their actions not a Box
     """
 
@@ -90,6 +92,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         state_dim: int = 0,
         schedule: Schedule | None = None,
         gives_up: GivesUp | None = None,
+        on_bad_step: OnBadStep = "stop",
     ) -> None:
         space = check_goal_space(venv.observation_space, venv.action_space)
         venv = with_episode_limit(venv)
@@ -104,6 +107,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         ends_early = rules.ends_when_reached or views.subgoals.event is not None
         self._task_can_tell = ends_early and can_tell(venv, views.subgoals)
         self.judge = EpisodeJudge(venv)
+        self.guard = Guard(venv, on_bad_step)
         self._started = False
         self._given: AnyArray = np.zeros(0)  # what step_async was given
 
@@ -118,7 +122,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
 
     def reset(self) -> FloatArray:
         """Reset every environment and ask for its first option."""
-        return self.begin(self.venv.reset())  # type: ignore[arg-type]
+        return self.begin(reset_or_name(self.venv))  # type: ignore[arg-type]
 
     def begin(self, observation: GoalObservation) -> FloatArray:
         """Ask for the first options of environments that were just reset.
@@ -127,7 +131,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         :return: what the low level sees
         """
         self._recorder.steps[:] = 0
-        self._refuse_bad(observation)
+        self.guard.begin(observation)
         self._begin_episodes(self._everywhere, observation)
         self._begin_options(self._everywhere, observation)
         self._started = True
@@ -150,6 +154,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
             if owner == "clock":
                 getattr(self.clock, name)[:] = array
         self._announce(self._everywhere)
+        self.guard.go_on(observation)
         self._started = True
         return self._low_observation(observation)
 
@@ -192,32 +197,21 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self._recorder.before_step(
             unit, no_memory if states is None else states, no_memory if next_states is None else next_states
         )
-        observation, task_rewards, dones, infos = step_or_name(self.venv, actions, self._recorder.steps)
-        seen = self._before_reset(observation, dones, infos)  # type: ignore[arg-type]
-        self._refuse_bad(seen, task_rewards)
-        self._recorder.after_step(task_rewards, seen)
-        self.clock.tick()
+        observation, task_rewards, dones, infos, seen, bad = self.guard.step(actions, self._recorder.steps)
+        taken = ~bad  # a bad step did not happen: what it led to is not known
+        self._recorder.after_step(task_rewards, seen, taken)
+        self.clock.tick(taken)
         over = self._windows_over(seen, dones)
         rewards, episodes = np.zeros(self.num_envs, dtype=np.float32), {}
         if np.count_nonzero(over):  # several times as fast as any() on so few
             where = np.flatnonzero(over)
             rewards[where] = self._close_options(where, seen, dones, infos)
             last = self._low_observation(seen) if for_low_level else None
-            episodes = self._next_options(where, observation, dones, infos)  # type: ignore[arg-type]
+            episodes = self._next_options(where, observation, dones, infos)
             if last is not None:
                 _tell_low_level(where, last, infos)
-        low = self._low_observation(observation)  # type: ignore[arg-type]
-        return HierarchicalStep(low, over, actions, observation, task_rewards, dones, infos, rewards, episodes)  # type: ignore[arg-type]
-
-    def _refuse_bad(self, seen: GoalObservation, rewards: FloatArray | None = None) -> None:
-        """Refuse observations and rewards that are not finite.
-
-        :raises NonFiniteError: naming environment, step and key
-        """
-        parts = [seen[key] for key in GOAL_KEYS]
-        if not all_finite(*parts if rewards is None else (*parts, rewards)):
-            steps = self._recorder.steps if rewards is None else self._recorder.steps + 1
-            raise refusal(seen, steps, rewards)
+        low = self._low_observation(observation)
+        return HierarchicalStep(low, over, actions, observation, task_rewards, dones, infos, rewards, episodes)
 
     def _windows_over(self, seen: GoalObservation, dones: BoolArray) -> BoolArray:
         """Which windows end with this step, ``(n_envs,)``.
@@ -237,22 +231,14 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
             over &= ~late
         return over
 
-    def _before_reset(self, observation: GoalObservation, dones: BoolArray, infos: list[Plain]) -> GoalObservation:
-        """What the step led to: SB3 hides the last observation of an episode in ``info``."""
-        if not np.count_nonzero(dones):
-            return observation
-        seen = {key: np.array(observation[key]) for key in GOAL_KEYS}
-        for index in np.flatnonzero(dones):
-            for key in GOAL_KEYS:
-                seen[key][index] = infos[index]["terminal_observation"][key]
-        return seen
-
     def _close_options(self, where: Indices, seen: GoalObservation, dones: BoolArray, infos: list[Plain]) -> FloatArray:
         """Record the options that end; the low level's reward of each."""
         here = {key: seen[key][where] for key in GOAL_KEYS}
         reached = self.clock.reached(here, where)
         rewards = np.zeros(len(where), dtype=np.float32)
         for row, index in enumerate(where):
+            if not self.clock.elapsed[index]:  # its first step was bad
+                continue
             step = int(self._recorder.steps[index])
             option = self.clock.close(index, step, bool(reached[row]), bool(dones[index]))
             self._recorder.options[index].append(option)
@@ -265,10 +251,10 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
     ) -> dict[int, Episode]:
         """Finish episodes and begin options."""
         over = where[dones[where]]
-        episodes = {int(index): self._finish_episode(index, infos[index]) for index in over}
+        told = [int(index) for index in over if self._recorder.steps[index]]
+        episodes = {index: self._finish_episode(index, infos[index]) for index in told}
         if len(over):
             self._begin_episodes(over, {key: observation[key][over] for key in GOAL_KEYS})
-            self._refuse_bad(observation)
         self._begin_options(where, observation)
         return episodes
 
@@ -317,5 +303,5 @@ CUT_OFF = tuple(
 def _tell_low_level(where: Indices, last: FloatArray, infos: list[Plain]) -> None:
     """Record in ``infos`` how windows ended, in the form in which SB3's algorithms expect the ends of episodes."""
     for index in where:
-        cut = infos[index]["option"]["reason"] in CUT_OFF
+        cut = "option" not in infos[index] or infos[index]["option"]["reason"] in CUT_OFF
         infos[index] |= {"terminal_observation": last[index], "TimeLimit.truncated": cut}

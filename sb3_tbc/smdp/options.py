@@ -200,9 +200,9 @@ class OptionClock:
         self.used[indices] += 1
         self._given_up[indices] = False
 
-    def tick(self) -> None:
-        """One environment step has passed everywhere."""
-        self.elapsed += 1
+    def tick(self, where: BoolArray | bool = True) -> None:
+        """One environment step has passed, everywhere or in the environments of a mask ``(n_envs,)``."""
+        self.elapsed += where
 
     @property
     def time_left(self) -> FloatArray:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.arrays import AnyArray, Arrays, FloatArray, Indices, IntArray
+from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices, IntArray
 from sb3_tbc.smdp.options import Episode, Option, TerminationReason
 from sb3_tbc.smdp.spaces import GoalObservation
 
@@ -55,10 +55,13 @@ class EpisodeRecorder:
             self._data["states"][at] = states
             self._data["next_states"][at] = next_states
 
-    def after_step(self, rewards: FloatArray, observation: GoalObservation) -> None:
-        """Record what the step led to in every environment, before any automatic reset."""
+    def after_step(self, rewards: FloatArray, observation: GoalObservation, taken: BoolArray | bool = True) -> None:
+        """Record what the step led to in every environment, before any automatic reset.
+
+        :param taken: where the step counts, ``(n_envs,)``; elsewhere ``observation`` is the one before it
+        """
         self._rewards[self._now()] = rewards
-        self.steps += 1
+        self.steps += taken
         self._write(self._now(), observation)
 
     def finish(self, index: int, terminated: bool, success: bool, budget_exhausted: bool = False) -> Episode:

@@ -36,6 +36,10 @@ class Slices:
 
     parts: tuple[Slice, ...]
 
+    def __post_init__(self) -> None:
+        """Slices that come from a file are tuples."""
+        object.__setattr__(self, "parts", tuple(Slice(*part) for part in self.parts))
+
     def __call__(self, observation: GoalObservation) -> FloatArray:
         """The entries, laid end to end, ``(..., n)``."""
         found = [observation[part.key][..., part.start : part.stop] for part in self.parts]

@@ -10,6 +10,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.replay.both_levels import Replay
+from sb3_tbc.smdp.faults import reset_or_name
+from sb3_tbc.smdp.guard import OnBadStep
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep, HierarchicalVecEnv, Proposal, Schedule
 from sb3_tbc.smdp.hindsight import (
     GoalTest,
@@ -43,6 +45,7 @@ class TwoLevelRunner:
     :param rng: source of all randomness here
     :param schedule: gives the time budgets where the high level does not
     :param deterministic: act as in an evaluation
+    :param on_bad_step: what follows where an environment gives what is not finite
     """
 
     def __init__(
@@ -54,17 +57,25 @@ class TwoLevelRunner:
         rng: np.random.Generator,
         schedule: Schedule | None = None,
         deterministic: bool = False,
+        on_bad_step: OnBadStep = "stop",
     ) -> None:
         self.actor, self.rng, self.deterministic = actor, rng, deterministic
         self.env = HierarchicalVecEnv(
-            venv, self.propose, views, rules, actor.low.state_dim, schedule, actor.reconsideration
+            venv,
+            self.propose,
+            views,
+            rules,
+            actor.low.state_dim,
+            schedule,
+            actor.reconsideration,
+            on_bad_step,
         )
         self.membrane = actor.blank(venv.num_envs)
         self.observation: FloatArray = np.zeros(0)  # the low level's
 
     def reset(self) -> None:
         """Begin new episodes."""
-        self.begin(self.env.venv.reset())  # type: ignore[arg-type]
+        self.begin(reset_or_name(self.env.venv))  # type: ignore[arg-type]
 
     def begin(self, observation: GoalObservation) -> None:
         """Begin episodes in environments that were just reset.
@@ -110,8 +121,9 @@ class Collector(TwoLevelRunner):
         rng: np.random.Generator,
         schedule: Schedule | None,
         exploration: Exploration,
+        on_bad_step: OnBadStep = "stop",
     ) -> None:
-        super().__init__(venv, actor, views, rules, rng, schedule)
+        super().__init__(venv, actor, views, rules, rng, schedule, on_bad_step=on_bad_step)
         self.exploration = exploration
 
     def get_state(self) -> Arrays:

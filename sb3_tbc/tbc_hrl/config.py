@@ -129,6 +129,9 @@ class AgentConfig(Settings):
     """Show the low level the distance to its subgoal instead of the subgoal itself."""
     compile: bool | Literal["auto"] = "auto"
     """Compile the updates; ``auto``: if a C++ compiler is found and the run is long enough to gain from it."""
+    on_bad_step: Literal["stop", "end-episode"] = "stop"
+    """What happens when an environment gives a value that is not finite or has the wrong shape. ``stop``: the run
+    stops, saved. ``end-episode``: the episode ends with the step before, and the next one begins."""
 
     def for_episodes_of(self, steps: int | None) -> Self:
         """These settings with ``max_options`` as a number.
@@ -283,5 +286,8 @@ class FlatConfig(Settings):
     goal_strategy: Literal["future", "episode", "event"] = "future"
     """Where hindsight goals come from. ``future``: later steps of the episode. ``episode``: any of its steps.
     ``event``: the step of the task's event."""
+    on_bad_step: Literal["stop", "end-episode"] = "stop"
+    """What happens when an environment gives a value that is not finite or has the wrong shape. ``stop``: the run
+    stops, saved. ``end-episode``: the episode ends with the step before, and the next one begins."""
     policy_kwargs: FlatPolicyConfig = FlatPolicyConfig()
     """Networks."""

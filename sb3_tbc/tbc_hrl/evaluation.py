@@ -10,7 +10,9 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tbc.aliases import Env
 from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_test import EpisodeJudge
+from sb3_tbc.smdp.guard import GuardedVecEnv
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
@@ -68,7 +70,7 @@ def evaluate_flat(
     deterministic: bool = True,
 ) -> EvaluationResult:
     """As :func:`evaluate_hierarchical`, for an agent without subgoals: these figures are NaN, decisions are 0."""
-    venv = _vector(env, n_eval_episodes)
+    venv: VecEnv = GuardedVecEnv(with_episode_limit(_vector(env, n_eval_episodes)), model.on_bad_step)
     judge = EpisodeJudge(venv)
     if seed is not None:
         venv.seed(seed)
@@ -107,8 +109,9 @@ def evaluate_hierarchical(
     """
     venv = _vector(env, n_eval_episodes)
     runner = TwoLevelRunner(
-        venv, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule, deterministic
-    )
+        venv, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule, deterministic,
+        model.config.on_bad_step,
+    )  # fmt: skip
     if seed is not None:
         venv.seed(seed)
     per_env = -(-n_eval_episodes // venv.num_envs)

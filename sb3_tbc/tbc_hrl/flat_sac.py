@@ -5,36 +5,32 @@ from __future__ import annotations
 import io
 import pathlib
 import warnings
-from typing import Any, ClassVar, TypeVar
+from typing import ClassVar, TypeVar
 
-import numpy as np
-import torch as th
-from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import (
-    DictReplayBufferSamples,
-    GymEnv,
-    MaybeCallback,
-    TrainFreq,
-    TrainFrequencyUnit,
-)
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import MultiInputPolicy
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.arrays import AnyArray
+from sb3_tbc.arrays import Arrays
 from sb3_tbc.files import write_arrays
+from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.both_levels import MORE
+from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_spaces import check_goal_space
-from sb3_tbc.smdp.goal_test import check_goal_test, goal_test_of
+from sb3_tbc.smdp.goal_test import check_goal_test
 from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
+from sb3_tbc.smdp.guard import GuardedVecEnv, OnBadStep
 from sb3_tbc.smdp.hindsight import check_goal_strategy
 from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSettings, takes
 from sb3_tbc.tbc_hrl.calls import whole_steps
 from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.environment import attribute_of
+from sb3_tbc.tbc_hrl.flat_replay import TerminatingHerReplayBuffer
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
@@ -42,48 +38,6 @@ SelfFlatSAC = TypeVar("SelfFlatSAC", bound="FlatSAC")
 
 CYCLE = 100
 """Environment steps between two bursts of updates."""
-
-
-class TerminatingHerReplayBuffer(HerReplayBuffer):
-    """SB3's hindsight replay for tasks that end on success: a relabelled transition that meets its goal is terminal.
-
-    SB3 keeps the flag that was stored, under which the value of standing on a relabelled goal never stops to grow.
-
-    :param event_goals: take the goal from the step of the task's event (:attr:`SubgoalSpace.event`) for all transitions
-        of an episode in which it happened, and leave those of the others as they are
-    :param kwargs: see SB3
-    """
-
-    def __init__(self, *args: Any, event_goals: bool = False, **kwargs: Any) -> None:
-        super().__init__(*args, **kwargs)
-        self.event_goals = event_goals
-
-    def _sample_goals(self, batch_indices: AnyArray, env_indices: AnyArray) -> AnyArray:
-        if not self.event_goals or self.env is None:
-            return super()._sample_goals(batch_indices, env_indices)
-        event = attribute_of(self.env, "subgoals").event
-        starts, lengths = (a[batch_indices, env_indices, None] for a in (self.ep_start, self.ep_length))
-        ahead = np.arange(lengths.max())
-        rows = (starts + ahead) % self.buffer_size
-        happened = (self.next_observations["observation"][rows, env_indices[:, None], event] > 0.5) & (ahead < lengths)
-        first = rows[np.arange(len(rows)), happened.argmax(axis=1)]
-        goals: AnyArray = np.where(
-            happened.any(axis=1, keepdims=True),
-            self.next_observations["achieved_goal"][first, env_indices],
-            self.observations["desired_goal"][batch_indices, env_indices],
-        )
-        return goals
-
-    def _get_virtual_samples(
-        self, batch_indices: AnyArray, env_indices: AnyArray, env: VecNormalize | None = None
-    ) -> DictReplayBufferSamples:
-        samples = super()._get_virtual_samples(batch_indices, env_indices, env)
-        if self.env is None:
-            raise ValueError("hindsight replay needs the environment's goal test; pass env when loading")
-        reached = samples.next_observations["achieved_goal"].cpu().numpy()
-        wanted = samples.observations["desired_goal"].cpu().numpy()
-        dones = goal_test_of(self.env).terminated(reached, wanted).astype(np.float32)
-        return samples._replace(dones=th.from_numpy(dones).reshape(-1, 1).to(self.device))
 
 
 class FlatSAC(PlainAlgorithm, SAC):
@@ -101,6 +55,7 @@ class FlatSAC(PlainAlgorithm, SAC):
     config_class: ClassVar[type[FlatConfig]] = FlatConfig
     stop_requested: bool
     """Set it to make :meth:`learn` return at the next point from which learning can be continued exactly."""
+    _guarded: GuardedVecEnv | None = None
     __signature__ = SignatureOfSettings(SB3Arguments)
 
     @takes(FlatArguments)
@@ -181,6 +136,13 @@ class FlatSAC(PlainAlgorithm, SAC):
             self._updated_at, self._owed = 0, 0.0
         if resumed and not resume.set_flat_state(self, self.env, resumed):
             self.close_running_episodes()
+        self._guarded = GuardedVecEnv(
+            with_episode_limit(self.env),
+            self.on_bad_step,
+            self._her_buffer().steps(),
+            self._last_obs,  # type: ignore[arg-type]
+        )
+        self._guarded.guard.begin(self._last_obs)  # type: ignore[arg-type]
         callback.on_training_start(locals(), globals())
         while True:
             if self.num_timesteps - self._updated_at >= CYCLE:
@@ -195,9 +157,9 @@ class FlatSAC(PlainAlgorithm, SAC):
 
     def _collect(self, steps: int, callback: BaseCallback, log_interval: int) -> bool:
         """Step every environment ``steps`` times; False if a callback asks to stop."""
-        assert self.env is not None
+        assert self._guarded is not None
         rollout = self.collect_rollouts(
-            self.env,
+            self._guarded,
             callback,
             TrainFreq(steps, TrainFrequencyUnit.STEP),
             self._her_buffer(),
@@ -220,19 +182,36 @@ class FlatSAC(PlainAlgorithm, SAC):
             self._owed -= updates
             self.train(updates, self.batch_size)
 
-    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+    @property
+    def on_bad_step(self) -> OnBadStep:
+        """What follows where an environment gives what is not finite."""
+        return self.settings.get("on_bad_step", "stop")  # type: ignore[no-any-return]
+
+    def dump_logs(self) -> None:
+        """Write what was seen since the last time, see SB3."""
+        if self._guarded is not None and self._guarded.guard.count:
+            self.logger.record("rollout/bad_steps", self._guarded.guard.count)
+        super().dump_logs()
+
+    def learning_state(self) -> Arrays:
+        """What learning goes on from besides weights and replay, as plain arrays: random streams, running episodes."""
+        return resume.get_flat_state(self)
+
+    def save_replay_buffer(
+        self, path: str | pathlib.Path | io.BufferedIOBase, learning_state: Arrays | None = None
+    ) -> None:
         """Write the replay buffer, and all else that is needed to continue learning, to one file of plain arrays.
 
         A model saved at the same moment and loaded together with this file continues with
         ``learn(..., reset_num_timesteps=False)`` as if it had never stopped, bit for bit.
+
+        :param learning_state: of an earlier moment that the buffer was put back to; by default that of now
         """
         buffer = self._her_buffer()
-        arrays: Plain = {name: getattr(buffer, name) for name in ARRAYS}
-        for part in ("observations", "next_observations"):
-            arrays |= {f"{part}.{key}": array for key, array in getattr(buffer, part).items()}
+        arrays: Plain = dict(buffer.parts())
         rows = buffer.buffer_size if buffer.full else buffer.pos
         arrays = {name: array[:rows] for name, array in arrays.items()}
-        more = {f"{MORE}.{name}": array for name, array in resume.get_flat_state(self).items()}
+        more = {f"{MORE}.{name}": array for name, array in (learning_state or self.learning_state()).items()}
         held = {"_start": buffer._current_ep_start, "pos": buffer.pos, "full": buffer.full}
         write_arrays(path, {**arrays, **held, **more})
 
@@ -243,27 +222,31 @@ class FlatSAC(PlainAlgorithm, SAC):
             continued
         :raises ValueError: if the file was written for other spaces or a larger buffer
         """
-        if not isinstance(getattr(self, "replay_buffer", None), HerReplayBuffer) and self.env is not None:
+        if not isinstance(getattr(self, "replay_buffer", None), TerminatingHerReplayBuffer) and self.env is not None:
             self.replay_buffer = TerminatingHerReplayBuffer(
                 self.buffer_size, self.observation_space, self.action_space, env=self.env, device=self.device,
                 n_envs=self.n_envs, **self.replay_buffer_kwargs,
             )  # fmt: skip
         buffer = self._her_buffer()
-        with np.load(path, allow_pickle=False) as arrays:
-            rows = len(arrays["actions"])
-            for name in arrays.files:
-                part, _, key = name.partition(".")
-                if part != MORE and (key or name in ARRAYS):
-                    held = getattr(buffer, part)[key] if key else getattr(buffer, name)
-                    if rows > len(held) or held.shape[1:] != arrays[name].shape[1:]:
-                        raise ValueError(f"saved replay buffer does not fit: {name} has shape {arrays[name].shape}")
-                    held[:rows] = arrays[name]
-            buffer._current_ep_start[:] = arrays["_start"]
-            buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
-            more = [name for name in arrays.files if name.startswith(f"{MORE}.")]
-            self._resumed = {name.removeprefix(f"{MORE}."): arrays[name] for name in more}
+        arrays = read_arrays(path)
+        try:
+            self._take_over(buffer, arrays)
+        except (KeyError, TypeError, IndexError) as error:
+            raise ValueError(f"{path} is no saved replay buffer of such an agent: {error!r}") from error
         if truncate_last_traj and not resume.can_go_on(self, self._resumed):
             self.close_running_episodes()
+
+    def _take_over(self, buffer: TerminatingHerReplayBuffer, arrays: Arrays) -> None:
+        rows = len(arrays["actions"])
+        for name, held in buffer.parts().items():
+            if len(arrays[name]) != rows or rows > len(held) or held.shape[1:] != arrays[name].shape[1:]:
+                raise ValueError(f"saved replay buffer does not fit: {name} has shape {arrays[name].shape}")
+        for name, held in buffer.parts().items():
+            held[:rows] = arrays[name]
+        buffer._current_ep_start[:] = arrays["_start"]
+        buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
+        more = [name for name in arrays if name.startswith(f"{MORE}.")]
+        self._resumed = {name.removeprefix(f"{MORE}."): arrays[name] for name in more}
 
     def close_running_episodes(self) -> None:
         """End the running episodes where they are: what was stored of them is used, and they are not continued."""
@@ -274,13 +257,9 @@ class FlatSAC(PlainAlgorithm, SAC):
                 buffer.truncate_last_trajectory()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_resumed", "stop_requested"]
+        return [*super()._excluded_save_params(), "_resumed", "stop_requested", "_guarded"]
 
-    def _her_buffer(self) -> HerReplayBuffer:
-        if not isinstance(self.replay_buffer, HerReplayBuffer):
+    def _her_buffer(self) -> TerminatingHerReplayBuffer:
+        if not isinstance(self.replay_buffer, TerminatingHerReplayBuffer):
             raise ValueError("there is no replay buffer: pass env when loading the agent")
         return self.replay_buffer
-
-
-ARRAYS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
-"""What SB3's hindsight buffer holds besides observations, each ``(buffer_size, n_envs, ...)``."""

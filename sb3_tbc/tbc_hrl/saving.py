@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import pathlib
 from collections.abc import Iterable
@@ -9,10 +10,13 @@ from typing import Any, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.files import save_atomic
+from sb3_tbc.smdp.episode_limit import with_episode_limit
+from sb3_tbc.smdp.faults import named_reset
 from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
 
@@ -45,6 +49,21 @@ class PlainAlgorithm(BaseAlgorithm):
         target = pathlib.Path(path)
         target = target if target.suffix else target.with_suffix(".zip")
         save_atomic(lambda name: pathlib.Path(name).write_bytes(content), target)
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **kwargs: Any,
+    ) -> tuple[int, BaseCallback]:
+        """Begin to learn, see SB3; an environment that fails or hangs at its first reset is named."""
+        resets = reset_num_timesteps or self._last_obs is None
+        if self.env is not None:
+            with_episode_limit(self.env)
+        with named_reset(self.env) if resets and self.env is not None else contextlib.nullcontext():
+            return super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
 
     def _plain(self, content: bytes) -> Plain:
         """What SB3 has pickled, as far as it has a plain form; the rest needs ``trust=True`` when it is loaded."""

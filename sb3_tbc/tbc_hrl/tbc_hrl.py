@@ -298,7 +298,8 @@ class TBCHRL(TwoLevelSaving):
         """
         if anew or self.collector is None:
             explore = assembly.exploration(self.config)
-            self.collector = Collector(env, self.actor, self.views, self.rules, self.rng, self.schedule, explore)
+            self.collector = Collector(env, self.actor, self.views, self.rules, self.rng, self.schedule, explore,
+                                       self.config.on_bad_step)  # fmt: skip
             self.collector.begin(self._last_obs if anew else env.reset())  # type: ignore[arg-type]
         if resumed:
             resume.set_state(self._moving_parts(), resumed)
@@ -399,6 +400,8 @@ class TBCHRL(TwoLevelSaving):
     def dump_logs(self) -> None:
         """Write what was seen since the last time: SB3's keys, and per level what explains learning."""
         record_progress(self)
+        if self.collector is not None and self.collector.env.guard.count:
+            self.logger.record("rollout/bad_steps", self.collector.env.guard.count)
         for name, value in self.diagnostics.drain().items():
             self.logger.record(name, value)
         self.logger.dump(step=self.num_timesteps)

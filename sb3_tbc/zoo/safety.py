@@ -16,6 +16,8 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import Arrays
 from sb3_tbc.errors import DivergedError
 from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.flat_replay import Rewind, TerminatingHerReplayBuffer
+from sb3_tbc.tbc_hrl.flat_sac import CYCLE, FlatSAC
 
 DIVERGED = 1e12
 """Critic loss beyond all sense: values of a million, where returns are of the order of 10 to 1000."""
@@ -77,8 +79,8 @@ class DivergenceCallback(BaseCallback):
 class ConsistentState(BaseCallback):
     """Remembers the last point to go on from, so that a fault of an environment in mid-rollout loses that rollout only.
 
-    While steps are collected neither weights nor replay change, so that all that must be remembered is small. From the
-    end of a rollout to the beginning of the next they do, and nothing is remembered.
+    While steps are collected no weights change, and of replay only what is added, so that all that must be remembered
+    is small. From the end of a rollout to the beginning of the next, updates run, and nothing is remembered.
     """
 
     ATTRIBUTES = (
@@ -90,16 +92,22 @@ class ConsistentState(BaseCallback):
         super().__init__()
         self._attributes: Plain = {}
         self._stored: tuple[int, ...] = ()
+        self._rewind: Rewind | None = None
         self._arrays: Arrays = {}
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
-        if isinstance(self.model, TBCHRL):
-            self._arrays = {name: np.array(array) for name, array in self.model.learning_state().items()}
-            self._stored = self._rows(self.model)
-            self._attributes = {n: deepcopy(getattr(self.model, n)) for n in self.ATTRIBUTES if hasattr(self.model, n)}
+        model = self.model
+        if isinstance(model, TBCHRL):
+            self._stored = self._rows(model)
+        elif isinstance(model, FlatSAC) and isinstance(model.replay_buffer, TerminatingHerReplayBuffer):
+            self._rewind = Rewind(model.replay_buffer, min(CYCLE, model.replay_buffer.buffer_size - 1))
+        else:
+            return
+        self._arrays = {name: np.array(array) for name, array in model.learning_state().items()}
+        self._attributes = {n: deepcopy(getattr(model, n)) for n in self.ATTRIBUTES if hasattr(model, n)}
 
     def _on_rollout_end(self) -> None:
         self._arrays, self._attributes = {}, {}
@@ -111,9 +119,15 @@ class ConsistentState(BaseCallback):
 
     def go_back(self) -> Callable[[Path], None] | None:
         """Take the agent back to that point, and return what writes its replay; None if there is no such point."""
-        model = self.model
-        if not self._attributes or not isinstance(model, TBCHRL) or self._rows(model) != self._stored:
+        model, arrays = self.model, self._arrays
+        if not self._attributes:
             return None
+        if isinstance(model, TBCHRL) and self._rows(model) != self._stored:
+            return model.save_replay_buffer  # the step was whole, a callback after it failed
         vars(model).update(self._attributes)
-        arrays = self._arrays
-        return lambda path: model.replay_buffer.save(path, arrays)
+        if isinstance(model, TBCHRL):
+            return lambda path: model.replay_buffer.save(path, arrays)
+        if self._rewind is not None and isinstance(model, FlatSAC):
+            self._rewind()
+            return lambda path: model.save_replay_buffer(path, arrays)
+        return None

@@ -194,9 +194,12 @@ def test_faults_of_a_task_name_environment_and_step() -> None:
 
     cases = {
         "raise": (EnvironmentFault, "environment 1 failed at step 2 of its episode: RuntimeError: simulator lost"),
-        "shape": (ValueError, r"environment 1, step 2 .*'observation'. must have shape \(3,\) .* got shape \(1,\)"),
-        "key": (ValueError, r"environment 1, step 2 .*'achieved_goal'. .* got nothing"),
-        "info": (ValueError, "environment 1, step 2 .* info must be a dictionary, got None"),
+        "shape": (
+            EnvironmentFault,
+            r"environment 1, step 2 .*'observation'. must have shape \(3,\) .* shape \(1,\)",
+        ),
+        "key": (EnvironmentFault, r"environment 1, step 2 .*'achieved_goal'. .* got nothing"),
+        "info": (EnvironmentFault, "environment 1, step 2 .* info must be a dictionary, got None"),
     }
     for fault, (error, message) in cases.items():
         venv = DummyVecEnv([lambda: Corridor(30, 5.0), lambda: Faulty(30, 5.0)])

@@ -1,0 +1,219 @@
+"""Nothing that is wrong gets from environments into replay: each step is looked at where it enters."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
+from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
+from sb3_tbc.errors import EnvironmentFault, NonFiniteError
+from sb3_tbc.smdp.episode_limit import BAD_STEP, CopyableVecEnvWrapper
+from sb3_tbc.smdp.faults import reset_or_name, step_or_name
+from sb3_tbc.smdp.finite import all_finite, not_finite, place
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+from sb3_tbc.smdp.spaces import GoalObservation
+
+OnBadStep = Literal["stop", "end-episode"]
+MOST_IN_A_ROW = 10
+"""Episodes of an environment that may be over with their first step before its bad steps end the run after all."""
+TOLD = 10
+"""Bad steps that are told of one by one; the later ones are only counted."""
+
+logger = logging.getLogger(__name__)
+
+
+class GuardedStep(NamedTuple):
+    """What a step of every environment led to, with nothing in it that is not finite."""
+
+    observation: GoalObservation  # after automatic resets
+    rewards: FloatArray  # (n_envs,)
+    dones: BoolArray  # (n_envs,)
+    infos: list[Plain]
+    seen: GoalObservation  # before automatic resets
+    bad: BoolArray  # (n_envs,), whose episode ended before this step, which is not to be stored
+
+
+class Guard:
+    """Steps a vector of goal environments and lets nothing through that is not finite or of another shape.
+
+    :param venv: the environments, with :func:`.with_episode_limit`, which looks at shapes
+    :param on_bad_step: ``stop``: raise; ``end-episode``: end the episode with the step before, and reset
+    """
+
+    def __init__(self, venv: VecEnv, on_bad_step: OnBadStep = "stop") -> None:
+        self.venv, self.on_bad_step = venv, on_bad_step
+        self.count = 0
+        self._none_bad = np.zeros(venv.num_envs, dtype=bool)
+        self._in_a_row = np.zeros(venv.num_envs, dtype=np.int64)
+        self._last: GoalObservation = {}
+
+    def reset(self) -> GoalObservation:
+        """Reset every environment.
+
+        :raises EnvironmentFault: if one fails, naming it
+        :raises NonFiniteError: see :meth:`begin`
+        """
+        observation: Any = reset_or_name(self.venv)
+        self.begin(observation)
+        return observation  # type: ignore[no-any-return]
+
+    def begin(self, observation: GoalObservation) -> None:
+        """Look at what environments show that were just reset.
+
+        :raises NonFiniteError: naming environment and key
+        """
+        self._refuse_resets(observation, np.ones(self.venv.num_envs, dtype=bool))
+        self._last = observation
+
+    def go_on(self, observation: GoalObservation) -> None:
+        """Go on with episodes that run already.
+
+        :param observation: what the environments show
+        """
+        self._last = observation
+
+    def step(self, actions: AnyArray, steps: AnyArray) -> GuardedStep:
+        """Step every environment.
+
+        :param steps: of the running episodes so far, ``(n_envs,)``
+        :raises EnvironmentFault: if an environment fails, dies or hangs, or a value has another shape than it should
+        :raises NonFiniteError: for what is not finite, naming environment, step and key
+        """
+        if not all_finite(actions):
+            index = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
+            what = f"the action is not finite: {actions[index].tolist()}"
+            raise NonFiniteError(f"{place(index, int(steps[index]) + 1)}: {what}. The agent's own networks give it")
+        observation, rewards, dones, given = step_or_name(self.venv, actions, steps)
+        infos: list[Plain] = list(given)
+        seen = before_reset(observation, dones, infos)  # type: ignore[arg-type]
+        well = all_finite(*(seen[key] for key in GOAL_KEYS), rewards) and not any(BAD_STEP in info for info in infos)
+        bad = self._none_bad if well else self._end_bad(observation, rewards, dones, infos, seen, steps)  # type: ignore[arg-type]
+        if np.count_nonzero(dones):
+            self._refuse_resets(observation, dones)  # type: ignore[arg-type]
+        self._last = observation  # type: ignore[assignment]
+        return GuardedStep(observation, rewards, dones, infos, seen, bad)  # type: ignore[arg-type]
+
+    def _refuse_resets(self, observation: GoalObservation, where: BoolArray) -> None:
+        """Nothing can be done about an episode that begins badly."""
+        reset_infos = getattr(self.venv.unwrapped, "reset_infos", ())
+        told = {index: info[BAD_STEP] for index, info in enumerate(reset_infos) if info and BAD_STEP in info}
+        if not told and all_finite(*(observation[key] for key in GOAL_KEYS)):
+            return
+        for index in np.flatnonzero(where):
+            _raise(int(index), 0, told.get(int(index)), observation, None, "A reset cannot be skipped")
+
+    def _end_bad(
+        self, observation: Plain, rewards: Any, dones: Any, infos: list[Plain], seen: Plain, steps: AnyArray
+    ) -> BoolArray:
+        """End the episodes whose step is bad with the step before, in place; which those are."""
+        bad = self._none_bad.copy()
+        for index in range(self.venv.num_envs):
+            step, told = int(steps[index]) + 1, infos[index].get(BAD_STEP)
+            what = told or not_finite(index, seen, rewards)
+            if what is None:
+                continue
+            self._in_a_row[index] = self._in_a_row[index] + 1 if step == 1 else 0
+            if self.on_bad_step == "stop" or self._in_a_row[index] > MOST_IN_A_ROW:
+                _raise(index, step, told, seen, rewards, "The step was not stored: look into the environment")
+            self._tell(f"{place(index, step)}: {what}")
+            bad[index] = True
+            rewards[index] = 0.0
+            last = {key: np.array(part[index]) for key, part in self._last.items()}
+            for key, part in last.items():
+                seen[key][index] = part
+            if not dones[index]:
+                fresh, info = self.venv.env_method("reset", indices=[index])[0]
+                _refuse_reset(index, fresh, info, observation)
+                for key, part in observation.items():
+                    part[index] = fresh[key]
+                dones[index] = True
+            infos[index] = {"terminal_observation": last, "TimeLimit.truncated": True, "is_success": False,
+                            BAD_STEP: what}  # fmt: skip
+        return bad
+
+    def _tell(self, what: str) -> None:
+        self.count += 1
+        if self.count <= TOLD:
+            more = "; further ones are only counted" if self.count == TOLD else ""
+            logger.warning(f"{what}. Its episode ends with the step before{more}")
+
+
+def _refuse_reset(index: int, fresh: Any, info: Plain, observation: Plain) -> None:
+    alone = {key: np.asarray(fresh[key])[None] for key in observation}
+    if BAD_STEP in info or not all_finite(*(alone[key] for key in GOAL_KEYS)):
+        told = info.get(BAD_STEP) or not_finite(0, alone)
+        _raise(index, 0, told, alone, None, "A reset cannot be skipped")
+
+
+def _raise(
+    index: int, step: int, told: str | None, seen: GoalObservation, rewards: FloatArray | None, then: str
+) -> None:
+    """Raise for what is wrong with one environment, if anything is.
+
+    :param told: what its episode limit says is wrong; None if that found nothing
+    :raises EnvironmentFault: for what it said
+    :raises NonFiniteError: for what is not finite
+    """
+    if told is not None:
+        raise EnvironmentFault(f"{place(index, step)}: {told}. {then}")
+    what = not_finite(index, seen, rewards)
+    if what is not None:
+        raise NonFiniteError(f"{place(index, step)}: {what}. {then}")
+
+
+def before_reset(observation: GoalObservation, dones: BoolArray, infos: list[Plain]) -> GoalObservation:
+    """What a step led to: SB3 hides the last observation of an episode in ``info``."""
+    ended = np.flatnonzero(dones) if np.count_nonzero(dones) else ()
+    bad = [index for index, info in enumerate(infos) if BAD_STEP in info]
+    if not len(ended) and not bad:
+        return observation
+    seen = {key: np.array(observation[key]) for key in observation}
+    for index in ended:
+        for key in seen:
+            seen[key][index] = infos[index]["terminal_observation"][key]
+    return seen
+
+
+class GuardedVecEnv(CopyableVecEnvWrapper):
+    """The same in the form of a vector, for SB3's own algorithms.
+
+    :param venv: see :class:`Guard`
+    :param on_bad_step: likewise
+    :param steps: of the running episodes so far, ``(n_envs,)``
+    :param observation: what the environments show; None before they are reset
+    """
+
+    def __init__(
+        self,
+        venv: VecEnv,
+        on_bad_step: OnBadStep = "stop",
+        steps: AnyArray | None = None,
+        observation: GoalObservation | None = None,
+    ) -> None:
+        super().__init__(venv)
+        self.guard = Guard(venv, on_bad_step)
+        self.steps = np.zeros(venv.num_envs, dtype=np.int64) if steps is None else steps.copy()
+        self._actions: AnyArray = np.zeros(0)
+        if observation is not None:
+            self.guard.go_on(observation)
+
+    def reset(self) -> VecEnvObs:
+        """Reset every environment, see :meth:`Guard.reset`."""
+        self.steps[:] = 0
+        return self.guard.reset()  # type: ignore[return-value]
+
+    def step_async(self, actions: AnyArray) -> None:
+        """Take note of the actions."""
+        self._actions = actions
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Step, see :meth:`Guard.step`."""
+        step = self.guard.step(self._actions, self.steps)
+        self.steps += 1
+        self.steps[step.dones] = 0
+        return step.observation, step.rewards, step.dones, step.infos  # type: ignore[return-value]

@@ -1,0 +1,120 @@
+"""Replay of the flat baseline: SB3's hindsight buffer for tasks that end on success, which can be wound back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import AnyArray, Arrays
+from sb3_tbc.smdp.episode_limit import BAD_STEP
+from sb3_tbc.smdp.goal_test import goal_test_of
+from sb3_tbc.tbc_hrl.environment import attribute_of
+
+ARRAYS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
+"""What SB3's hindsight buffer holds besides observations, each ``(buffer_size, n_envs, ...)``."""
+
+
+class TerminatingHerReplayBuffer(HerReplayBuffer):
+    """SB3's hindsight replay for tasks that end on success: a relabelled transition that meets its goal is terminal.
+
+    SB3 keeps the flag that was stored, under which the value of standing on a relabelled goal never stops to grow.
+
+    :param event_goals: take the goal from the step of the task's event (:attr:`SubgoalSpace.event`) for all transitions
+        of an episode in which it happened, and leave those of the others as they are
+    :param kwargs: see SB3
+    """
+
+    def __init__(self, *args: Any, event_goals: bool = False, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.event_goals = event_goals
+
+    def _sample_goals(self, batch_indices: AnyArray, env_indices: AnyArray) -> AnyArray:
+        if not self.event_goals or self.env is None:
+            return super()._sample_goals(batch_indices, env_indices)
+        event = attribute_of(self.env, "subgoals").event
+        starts, lengths = (a[batch_indices, env_indices, None] for a in (self.ep_start, self.ep_length))
+        ahead = np.arange(lengths.max())
+        rows = (starts + ahead) % self.buffer_size
+        happened = (self.next_observations["observation"][rows, env_indices[:, None], event] > 0.5) & (ahead < lengths)
+        first = rows[np.arange(len(rows)), happened.argmax(axis=1)]
+        goals: AnyArray = np.where(
+            happened.any(axis=1, keepdims=True),
+            self.next_observations["achieved_goal"][first, env_indices],
+            self.observations["desired_goal"][batch_indices, env_indices],
+        )
+        return goals
+
+    def _get_virtual_samples(
+        self, batch_indices: AnyArray, env_indices: AnyArray, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples:
+        samples = super()._get_virtual_samples(batch_indices, env_indices, env)
+        if self.env is None:
+            raise ValueError("hindsight replay needs the environment's goal test; pass env when loading")
+        reached = samples.next_observations["achieved_goal"].cpu().numpy()
+        wanted = samples.observations["desired_goal"].cpu().numpy()
+        dones = goal_test_of(self.env).terminated(reached, wanted).astype(np.float32)
+        return samples._replace(dones=th.from_numpy(dones).reshape(-1, 1).to(self.device))
+
+    def add(
+        self,
+        obs: Any,
+        next_obs: Any,
+        action: AnyArray,
+        reward: AnyArray,
+        done: AnyArray,
+        infos: list[Plain],
+    ) -> None:
+        """Store a step of every environment, see SB3; a bad one ends its episode with the step before.
+
+        All environments share a row. That of a bad step belongs to no episode, so that it is never sampled.
+        """
+        bad = [index for index, info in enumerate(infos) if BAD_STEP in info]
+        for index in bad:
+            if self._current_ep_start[index] != self.pos:
+                self.dones[self.pos - 1, index] = self.timeouts[self.pos - 1, index] = True
+                self._compute_episode_length(index)
+        if bad:
+            done = np.array(done)
+            done[bad] = False
+        super().add(obs, next_obs, action, reward, done, infos)
+        self._current_ep_start[bad] = self.pos
+
+    def parts(self) -> Arrays:
+        """All that is stored, by name: views of whole arrays, ``(buffer_size, n_envs, ...)``."""
+        held: Arrays = {name: getattr(self, name) for name in ARRAYS}
+        for part in ("observations", "next_observations"):
+            held |= {f"{part}.{key}": array for key, array in getattr(self, part).items()}
+        return held
+
+    def steps(self) -> AnyArray:
+        """Steps of the running episodes so far, ``(n_envs,)``."""
+        return np.asarray((self.pos - self._current_ep_start) % self.buffer_size)
+
+
+class Rewind:
+    """Puts a buffer back to where it is now, after so many further steps at most.
+
+    :param buffer: to be put back
+    :param steps: rows that may be written before that
+    """
+
+    def __init__(self, buffer: TerminatingHerReplayBuffer, steps: int) -> None:
+        self._buffer = buffer
+        self._place = buffer.pos, buffer.full, buffer._current_ep_start.copy()
+        written = np.arange(buffer.pos - 1, buffer.pos + steps) % buffer.buffer_size  # and the end of a cut episode
+        self._rows = written, {name: array[written].copy() for name, array in buffer.parts().items()}
+        self._lengths = buffer.ep_length[: buffer.buffer_size if buffer.full else buffer.pos].copy()
+
+    def __call__(self) -> None:
+        """Put it back."""
+        buffer, (written, rows) = self._buffer, self._rows
+        buffer.pos, buffer.full, buffer._current_ep_start = self._place[0], self._place[1], self._place[2].copy()
+        for name, array in buffer.parts().items():
+            array[written] = rows[name]
+        buffer.ep_length[: len(self._lengths)] = self._lengths
