@@ -1,1 +1,1 @@
-"""Configurations, run folders and the results ledger: what stands behind the commands."""
+"""Configurations, run folders and the results ledger, on which the commands rest."""

@@ -1,4 +1,4 @@
-"""Ablations of TBC-HRL, and the widths that keep their number of parameters that of the full model (table 3)."""
+"""Ablations of TBC-HRL, with network widths that give them as many parameters as the full model (table 3)."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def parameter_count(model: TBCHRL) -> int:
 def match_parameters(run: RunConfig, full: RunConfig, env_id: str) -> Matched:
     """Give an ablated run the hidden widths with which it has as many parameters as the full one.
 
-    Where the circuit was taken out, the low level's MLP actor gets the circuit's parameters; where inputs or outputs
-    were, the critics' last hidden layers are widened.
+    An ablation without the circuit gets a low-level MLP actor with as many parameters as the circuit had. One without
+    some inputs or outputs gets wider last hidden layers in the critics.
 
     :param run: the ablated configuration
     :param full: the same without the ablation

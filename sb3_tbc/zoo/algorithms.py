@@ -1,4 +1,4 @@
-"""From an algorithm's name to its class, and from a ``.zip`` to an agent, with clear refusals."""
+"""Finds the class of an algorithm by name, and loads agents from ``.zip`` files with clear error messages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import re
 import shlex
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TypedDict, Unpack
 
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -23,7 +23,7 @@ from sb3_tbc.zoo.environments import make_envs
 Agent = TBCHRL | FlatSAC
 ALGORITHMS: dict[str, type[TBCHRL] | type[FlatSAC]] = {"tbc-hrl": TBCHRL, "hits": HiTS, "hac": HAC, "sac": FlatSAC}
 RUN_INFO = "run_info"
-"""Attribute, and key in the ``.zip``, with what the runner knows of a run: task, environment, variant, seed."""
+"""Attribute, and key in the ``.zip``, that describe a run: task, environment, variant, seed."""
 
 
 def algorithm(name: str) -> type[TBCHRL] | type[FlatSAC]:
@@ -36,13 +36,21 @@ def algorithm(name: str) -> type[TBCHRL] | type[FlatSAC]:
     return ALGORITHMS[name]
 
 
-def build_model(run: RunConfig, env: VecEnv, seed: int, **options: Any) -> Agent:
+class BuildOptions(TypedDict, total=False):
+    """Arguments of an agent's constructor that are not settings."""
+
+    device: str
+    verbose: int
+    tensorboard_log: str | None
+
+
+def build_model(run: RunConfig, env: VecEnv, seed: int, **options: Unpack[BuildOptions]) -> Agent:
     """Build the agent of a configuration.
 
     :param run: what to build
     :param env: training environments
-    :param seed: of networks, sampling and environments
-    :param options: ``device``, ``verbose``, ``tensorboard_log``
+    :param seed: seed of the networks, of sampling and of the environments
+    :param options: see :class:`BuildOptions`
     :raises ConfigError: if the agent refuses a setting or the environment
     """
     settings = dict(run.model)
@@ -68,7 +76,7 @@ def read_zip(path: Path) -> Plain:
 
 
 def _inside(folder: Path) -> str:
-    """What to give instead of a folder: the agent in it, where there is one."""
+    """The part of a message that names the agent inside a folder, if there is one."""
     found = sorted(folder.rglob("model.zip"), key=lambda p: (p.parent.name == "checkpoint", p))
     found = found or sorted(folder.rglob("*.zip"))
     if not found:
@@ -78,21 +86,21 @@ def _inside(folder: Path) -> str:
 
 
 def environment_of(path: Path, data: Plain, trust: bool = False) -> tuple[str, Plain]:
-    """Id and arguments of the environment that an agent says it was trained on.
+    """Id and arguments of the environment on which an agent was trained, as its ``.zip`` gives them.
 
-    :param path: of the agent, for messages
-    :param data: as :func:`read_zip` gave it
+    :param path: file of the agent, for messages
+    :param data: result of :func:`read_zip`
     :param trust: whether a module that the agent names may be imported
     :raises UntrustedError: if the id names a module, other than Gymnasium-Robotics, that would be imported
-    :raises ConfigError: if it does not say, or what it says is no environment
+    :raises ConfigError: if it names none, or what it names is not an environment
     """
     info = data.get(RUN_INFO)
     info = info if isinstance(info, dict) else {}
     env_id, env_kwargs = info.get("env_id"), info.get("env_kwargs", {})
     if env_id is None:
-        raise ConfigError(f"{path} does not say what environment it was trained on; pass --env")
+        raise ConfigError(f"{path} does not say on which environment it was trained; pass --env")
     if not isinstance(env_id, str) or not isinstance(env_kwargs, dict):
-        raise ConfigError(f"{path} names no environment, but {one_line(env_id)!r}; pass --env")
+        raise ConfigError(f"{path} gives {one_line(env_id)!r} where the id of an environment is expected; pass --env")
     module = env_id.rpartition(":")[0]
     if module and not trust and module != ROBOTICS and module not in sys.modules:
         raise UntrustedError(
@@ -123,7 +131,7 @@ def algorithm_of(path: Path, data: Plain) -> str:
 
 
 def observation_size(data: Plain) -> int | None:
-    """Entries of ``observation`` that an agent acts on, from what its ``.zip`` says; None if it does not say."""
+    """Size of the ``observation`` on which an agent acts, read from its ``.zip``; None if it is not given there."""
     space = data.get("observation_space")
     described = str(space.get("spaces")) if isinstance(space, dict) else ""
     found = re.search(r"'observation': Box\([^()]*\((\d+),\)", described)
@@ -134,7 +142,7 @@ def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu", trust
     """Load an agent of any of our algorithms.
 
     :param path: the ``.zip``
-    :param env: environments to act in; an agent that needs some to be loaded gets those it was trained on
+    :param env: environments to act in; a flat agent cannot be loaded without and makes its own by default
     :param device: torch device
     :param trust: whether code from the file may run, see :meth:`.PlainAlgorithm.load`
     :raises UntrustedError: if it cannot be loaded without that
@@ -158,9 +166,9 @@ def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu", trust
 def load_two_levels(path: Path, env: VecEnv | None = None, device: str = "cpu", trust: bool = False) -> TBCHRL:
     """Load an agent that has subgoals.
 
-    :raises ConfigError: if it cannot be loaded or has none
+    :raises ConfigError: if it cannot be loaded or has only one level
     """
     model = load_model(path, env, device, trust)
     if not isinstance(model, TBCHRL):
-        raise ConfigError(f"{path} holds a flat agent, without the two levels that are needed here")
+        raise ConfigError(f"{path} holds a flat agent; this command needs one with two levels")
     return model

@@ -1,4 +1,4 @@
-"""Watching a run: success evaluations with a CSV record, the trace of options, checkpoints by the clock."""
+"""Callbacks of a run: evaluations of success with a CSV record, a trace of options, timed checkpoints."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import os
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EventCallback
 from stable_baselines3.common.vec_env import VecEnv
@@ -38,7 +39,7 @@ class EvaluationRow(NamedTuple):
 
 
 def write_evaluations(path: Path, rows: Iterable[EvaluationRow]) -> None:
-    """Write ``evaluations.csv`` whole; it is small, and so a crash leaves the old one or the new one."""
+    """Rewrite ``evaluations.csv`` as a whole, so that a crash leaves either the old file or the new one."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(EvaluationRow._fields)
@@ -62,7 +63,7 @@ def read_evaluations(path: Path) -> list[EvaluationRow]:
         try:
             return [_parse_row(row) for row in reader]
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
-            raise ConfigError(f"{path} holds a line that is no evaluation: {one_line(error)}") from error
+            raise ConfigError(f"{path} holds a line that is not an evaluation: {one_line(error)}") from error
 
 
 def _parse_row(row: dict[str, str]) -> EvaluationRow:
@@ -71,8 +72,8 @@ def _parse_row(row: dict[str, str]) -> EvaluationRow:
     return EvaluationRow(timesteps=steps, episodes=episodes, **values)
 
 
-def finite_mean(values: Any) -> float:
-    """Mean of the finite values, NaN if there is none (an episode without a finished window has no window length)."""
+def finite_mean(values: ArrayLike) -> float:
+    """Mean of the finite values, NaN if there are none (an episode in which no window ended has no window length)."""
     array = np.asarray(values, dtype=np.float64)
     array = array[np.isfinite(array)]
     return float(array.mean()) if array.size else float("nan")
@@ -81,14 +82,14 @@ def finite_mean(values: Any) -> float:
 class SuccessEvalCallback(EventCallback):
     """Evaluates the deterministic agent every ``eval_freq`` environment steps and keeps the best by success rate.
 
-    SB3's ``EvalCallback`` keeps the best by mean reward, which says little on sparse tasks and nothing of subgoals.
+    SB3's ``EvalCallback`` keeps the best by mean reward, which says little on sparse tasks and does not log subgoals.
 
-    :param eval_env: one or several environments of their own, not those of training
+    :param eval_env: one or several environments, separate from those of training
     :param eval_freq: environment steps between evaluations (all environments counted)
     :param n_eval_episodes: episodes per evaluation
-    :param seed: evaluation ``k`` runs on seed ``seed + 1000 k``, whatever training does
-    :param csv_path: where the rows go, rewritten after each evaluation; rows already there are continued
-    :param best_model_path: where the best agent is saved; of equals, the one with shorter episodes
+    :param seed: evaluation ``k`` runs on seed ``seed + 1000 k``, independently of training
+    :param csv_path: file of the rows, rewritten after each evaluation; rows that are already there are kept
+    :param best_model_path: where the best agent is saved; among equal success rates the one with shorter episodes
     :param wall_time: seconds that earlier parts of a resumed run took
     :param callback_on_new_best: called after a new best was saved
     :param callback_after_eval: called after each evaluation; returning ``False`` stops training
@@ -168,7 +169,7 @@ class SuccessEvalCallback(EventCallback):
         self.logger.dump(self.num_timesteps)
         if is_best and self.best_model_path is not None:
             save_atomic(self.model.save, self.best_model_path)
-        if self.csv_path is not None:  # after the agent that it may call the best
+        if self.csv_path is not None:  # after saving the agent that this row may mark as the best
             write_evaluations(self.csv_path, self.rows)
         if is_best and self.callback_on_new_best is not None:
             self.callback_on_new_best.on_step()
@@ -185,10 +186,10 @@ def _quality(row: EvaluationRow) -> tuple[float, float]:
 
 
 class OptionTraceCallback(BaseCallback):
-    """Writes every option of training to a CSV: when, where, subgoal, time budget, duration, reason of its end.
+    """Writes every option of training to a CSV: step, environment, subgoal, time budget, duration, reason of its end.
 
-    :param path: the CSV file; what it holds of the steps before training begins is kept, as a resumed run needs it
-    :param every: write every n-th option only, which bounds the size of the file
+    :param path: the CSV file; a resumed run keeps its rows up to the step from which it resumes
+    :param every: write every n-th option only, to keep the file small
     """
 
     HEADER = ("timesteps", "env", "time_budget", "duration", "reached", "reason", "episode_over", "subgoal")
@@ -227,7 +228,7 @@ class OptionTraceCallback(BaseCallback):
             csv.writer(self._file, lineterminator="\n").writerow(row)
 
     def flush(self) -> None:
-        """Put what was written on the disk: a checkpoint that is to be resumed from needs the options before it."""
+        """Put what was written on the disk, so that a checkpoint never has more steps than the trace."""
         if self._file is not None:
             with explained(self.path):
                 self._file.flush()
@@ -240,7 +241,7 @@ class OptionTraceCallback(BaseCallback):
 
 
 def keep_trace(path: Path, header: tuple[str, ...], timesteps: int) -> None:
-    """Leave in a trace what happened up to a step, whole lines only; without a file, begin one."""
+    """Keep the complete lines of a trace up to a step; create the file if there is none."""
     with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as kept:
         csv.writer(kept, lineterminator="\n").writerow(header)
         if not timesteps or not path.is_file():
@@ -253,15 +254,17 @@ def keep_trace(path: Path, header: tuple[str, ...], timesteps: int) -> None:
 
 
 class StopTraining(Exception):
-    """The user asked to stop, and training is at a point from which it can go on exactly."""
+    """The user asked to stop, and training is at a point from which it can be resumed exactly."""
 
 
 class TimedCheckpointCallback(BaseCallback):
-    """Calls ``save`` every so many seconds, between rollouts, when no option is half recorded; stops there when asked.
+    """Saves a checkpoint at fixed intervals, and stops training when asked.
+
+    Both happen between rollouts, when no option is half recorded.
 
     :param save: writes the checkpoint
     :param seconds: shortest time between two checkpoints
-    :param stop: whether the user asked to stop; :class:`StopTraining` ends training then, before anything is collected
+    :param stop: tells whether the user asked to stop; then :class:`StopTraining` is raised before the next rollout
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What can be trained: tasks with their steps, the time a run took, and the extras they need; algorithms."""
+"""What can be trained: the algorithms, and the tasks with their steps, the time of a run and the extras they need."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from sb3_tbc.zoo.environments import task_names
 EXTRAS = {"Platforms": "box2d", "Tennis2D": "box2d", "UR5ReacherBullet": "bullet"}
 """Task -> the extra of ``sb3_tbc`` that installs what it needs."""
 ALGORITHM_TEXTS = {
-    "tbc-hrl": "two levels, timed subgoals, the low level a sparse circuit of neurons",
+    "tbc-hrl": "two levels, timed subgoals; the low level is a sparse circuit of neurons",
     "hits": "two levels, timed subgoals, MLPs",
     "hac": "two levels, subgoals without a time",
     "sac": "one level: SAC with hindsight goals",
 }
 MEASURED = "measured.yml"
-"""Beside this module: minutes of finished runs, which ``python -m sb3_tbc.report --measured`` writes."""
+"""File beside this module with the minutes of finished runs, written by ``python -m sb3_tbc.report --measured``."""
 
 
 def measured() -> dict[str, Plain]:
@@ -42,7 +42,7 @@ def catalogue() -> str:
     lines.append("  or any other registered goal environment, e.g. FetchReach-v4")
     lines += ["", "algorithms", *(f"  {name:<17} {ALGORITHM_TEXTS[name]}" for name in ALGORITHMS)]
     lines += ["", "steps:   environment steps of a run by default"]
-    lines += ["minutes: what a committed run of tbc-hrl with the shipped settings took, one core, evaluations included"]
+    lines += ["minutes: time of a committed run of tbc-hrl with the shipped settings on one core, evaluations included"]
     lines += ["extra:   install it with pip install 'sb3_tbc[extra]'"]
     return "\n".join(lines)
 

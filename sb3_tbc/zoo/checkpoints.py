@@ -1,7 +1,7 @@
-"""Checkpoints of a run: the last two, whole or not at all, with checksums that tell a damaged file.
+"""Checkpoints of a run: the last two are kept, with checksums that reveal a damaged file.
 
-Whatever the moment at which the process dies, the folder holds the newest or the one before: a new one is written aside
-and put on the disk, then takes its name; only then, with the next, the oldest goes.
+A new checkpoint is first written completely under another name and then renamed. The oldest is removed only after that.
+So whenever the process dies, the folder holds at least one complete checkpoint.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint whose files are whole.
+    """A checkpoint whose files are complete and undamaged.
 
     :param path: its folder
     :param timesteps: environment steps done
@@ -55,11 +55,11 @@ def save_checkpoint(
     save_model: Callable[[Path], object],
     save_replay: Callable[[Path], object],
 ) -> None:
-    """Write a checkpoint into a run's folder; the one before stays, the one before that goes.
+    """Write a checkpoint into a run's folder; the previous one is kept, the one before that is removed.
 
     :param save_model: writes the agent to a path
     :param save_replay: writes the replay buffers to a path
-    :raises WriteError: if it cannot be written; the earlier ones are untouched then
+    :raises WriteError: if it cannot be written; the earlier checkpoints are then unchanged
     """
     newest, before, new = run / NEWEST, run / BEFORE, run / "checkpoint.new"
     remove_unfinished(run)
@@ -98,9 +98,9 @@ def _sum_of(state: Plain) -> str:
 
 
 def find_checkpoint(run: Path) -> Checkpoint | None:
-    """The newest checkpoint of a run that is whole; damaged ones are named in the log. None if there is none.
+    """The newest undamaged checkpoint of a run, or None if there is no checkpoint. Damaged ones are named in the log.
 
-    :raises ConfigError: if there are checkpoints, but all are damaged, naming each file
+    :raises ConfigError: if all checkpoints are damaged; the message names each file
     """
     damage: list[str] = []
     for folder in _candidates(run):
@@ -110,15 +110,15 @@ def find_checkpoint(run: Path) -> Checkpoint | None:
             damage.append(str(error))
             continue
         if damage:
-            logger.warning(f"{'; '.join(damage)}; going on from the checkpoint before, at {found.timesteps} steps")
+            logger.warning(f"{'; '.join(damage)}; resuming from the previous checkpoint, at {found.timesteps} steps")
         return found
     if damage:
-        raise ConfigError(f"no whole checkpoint: {'; '.join(damage)}; start the run again with --overwrite")
+        raise ConfigError(f"no undamaged checkpoint: {'; '.join(damage)}; start the run again with --overwrite")
     return None
 
 
 def has_checkpoint(run: Path) -> bool:
-    """Whether there is something to resume from, whole or not."""
+    """Whether there is a checkpoint, damaged or not."""
     return any(True for _ in _candidates(run))
 
 
@@ -127,7 +127,7 @@ def _candidates(run: Path) -> Iterator[Path]:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint:
-    """Read a checkpoint's state and compare its files with their checksums; those of earlier versions have none.
+    """Read a checkpoint's state and check its files against their checksums; earlier versions stored none.
 
     :raises ConfigError: naming the damaged or missing file
     """
@@ -150,7 +150,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
 
 
 def keep_only(run: Path, checkpoint: Checkpoint) -> Checkpoint:
-    """Make a checkpoint the newest, so that the next one does not push it out; a damaged one is put aside.
+    """Make a checkpoint the newest, so that the next one does not replace it; a damaged newer one is renamed.
 
     :return: the same checkpoint under its new name
     """
@@ -167,7 +167,7 @@ def keep_only(run: Path, checkpoint: Checkpoint) -> Checkpoint:
 
 
 def remove_unfinished(run: Path) -> None:
-    """Remove what killed processes left of checkpoints that they were writing."""
+    """Remove half-written checkpoints that killed processes left behind."""
     for folder in run.glob(UNFINISHED):
         remove(folder)
 

@@ -22,23 +22,24 @@ ABLATIONS: dict[str, Plain] = {
 }
 """Ablation name -> what it overrides, merged after the task's section.
 
-``no-ts`` takes timed scheduling out: windows of a constant length (``dt_max``), no remaining time for the low level to
-see, one discount per decision in place of ``gamma ** tau``. ``no-ndbc`` gives the low level an MLP. Both keep the full
-model's number of parameters, see :mod:`sb3_tbc.zoo.ablations`.
+``no-ts`` removes timed scheduling: windows have a constant length (``dt_max``), the low level does not see the
+remaining time, and a decision is discounted by a constant instead of ``gamma ** tau``.
+``no-ndbc`` gives the low level an MLP. Both keep the full model's number of parameters, see
+:mod:`sb3_tbc.zoo.ablations`.
 """
 
 
 @dataclass(frozen=True)
 class RunConfig:
-    """Everything that decides a run apart from its seed.
+    """Everything that determines a run, except its seed.
 
     :param algo: algorithm, e.g. ``tbc-hrl``
     :param task: short task name or environment id
     :param config: ``paper`` (the tables' values) or ``tuned``
     :param n_timesteps: environment steps
     :param n_envs: parallel environments
-    :param env_kwargs: for ``gymnasium.make``
-    :param model: for the algorithm's constructor
+    :param env_kwargs: arguments of ``gymnasium.make``
+    :param model: arguments of the algorithm's constructor
     """
 
     algo: str
@@ -50,12 +51,12 @@ class RunConfig:
     model: Plain = field(default_factory=dict)
 
     def to_dict(self) -> Plain:
-        """As plain data for ``config.yml``."""
+        """Return plain data for ``config.yml``."""
         return asdict(self)
 
     @classmethod
     def from_dict(cls, data: PlainMapping) -> RunConfig:
-        """Back from ``config.yml``.
+        """Build the configuration from the data of ``config.yml``.
 
         :raises ConfigError: if keys are missing or unknown
         """
@@ -66,7 +67,7 @@ class RunConfig:
 
 
 def merge(base: PlainMapping, change: PlainMapping) -> Plain:
-    """``base`` with ``change`` laid over it, section by section; a ``None`` replaces a whole section."""
+    """``base`` updated with ``change``, section by section; a ``None`` replaces a whole section."""
     result = dict(base)
     for key, value in change.items():
         old = result.get(key)
@@ -101,7 +102,7 @@ def read_file(path: Path, algo: str | None = None) -> dict[str, Plain]:
 
 
 def _checked(section: Plain, algo: str | None, where: str) -> Plain:
-    """A section and the ``tuned`` one inside of it."""
+    """Check a section and the ``tuned`` section inside it."""
     plain = {key: value for key, value in section.items() if key != "tuned"}
     tuned = section.get("tuned")
     checked = validate(plain, algo, where)
@@ -143,8 +144,8 @@ def load_config(
 
     :param algo: algorithm name, which is also the name of the shipped file
     :param task: section to use; an environment without a section of its own takes the one named ``other``
-    :param config: ``paper``, ``tuned``, or ``None`` for ``tuned`` where there is such a sub-section
-    :param overrides: what the command line changes, as :func:`parse_overrides` gives it
+    :param config: ``paper``, ``tuned``, or ``None`` for ``tuned`` if there is such a sub-section, else ``paper``
+    :param overrides: settings of the command line, from :func:`parse_overrides`
     :param ablation: name of an ablation
     :param path: another configuration file
     :raises ConfigError: for unknown names and wrong values
@@ -159,7 +160,7 @@ def load_config(
     if ablation is not None and ablation not in ABLATIONS:
         raise ConfigError(f"no ablation {ablation!r}; {nearest(ablation, ABLATIONS)}")
     if ablation is not None and algo != "tbc-hrl":
-        raise ConfigError(f"ablations are of tbc-hrl, there is none of {algo!r}")
+        raise ConfigError(f"only tbc-hrl has ablations, not {algo!r}")
     merged = merge(default, section)
     given = validate(overrides or {}, algo, f"--hyperparams for {algo}")
     for change in (tuned if config == "tuned" else {}, ABLATIONS.get(ablation or "", {}), given):
@@ -170,7 +171,7 @@ def load_config(
     run = {key: merged.pop(key) for key in RUN if merged.get(key) is not None}
     if "n_timesteps" not in run:
         raise ConfigError(
-            f"neither section {task} nor section default of {path} says n_timesteps; a file of your own takes the "
-            "place of the shipped one, so start from a copy of that"
+            f"neither section {task} nor section default of {path} gives n_timesteps; your file replaces the shipped "
+            "one as a whole, so start from a copy of that"
         )
     return RunConfig(algo=algo, task=task, config=config, model=merged, **run)

@@ -1,4 +1,4 @@
-"""From a name on the command line to goal environments."""
+"""Makes goal environments from a name on the command line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ OTHER_PACKAGES = {  # how ids begin: module that registers them, name of its dis
     "parking": ("highway_env", "highway-env"),
 }
 _DESCRIPTIONS: dict[str, GoalEnvDescription] = {}
-"""Descriptions by id and arguments: environments made alike need the random episodes only once."""
+"""Descriptions by id and arguments, so that equal environments need the random episodes only once."""
 
 
 def task_names() -> dict[str, str]:
@@ -40,12 +40,12 @@ def task_names() -> dict[str, str]:
 def resolve_env(name: str) -> tuple[str, str]:
     """Task name and environment id of ``Pendulum``, ``sb3_tbc/Pendulum-v0``, any registered id, or ``module:id``.
 
-    Upper and lower case make no difference.
+    Upper and lower case are not distinguished.
 
     Ids of Gymnasium-Robotics need no module: where it is installed, ``FetchReach-v4`` finds it.
 
-    :return: name (of run folders and of sections in configuration files) and id, the latter with its module, so that a
-        saved agent finds its environment again
+    :return: name (as in run folders and sections of configuration files), and id with its module, so that a saved
+        agent finds its environment again
     :raises ConfigError: naming the nearest known one
     """
     tasks = task_names()
@@ -64,7 +64,7 @@ def resolve_env(name: str) -> tuple[str, str]:
 
 
 def _as_spelt(name: str, known: Iterable[str]) -> str:
-    """The known name that differs from ``name`` in upper and lower case at most, where there is exactly one."""
+    """The known name that equals ``name`` but for upper and lower case, if there is exactly one; else ``name``."""
     alike = [other for other in known if other.lower() == name.lower()]
     return name if name in alike or len(alike) != 1 else alike[0]
 
@@ -77,7 +77,7 @@ def _import(module: str, name: str) -> None:
 
 
 def _hint(env_id: str) -> str:
-    """What to install or to write for an id that looks like one of a known package."""
+    """The part of a message that says how to get the environments of a known package."""
     found = [place for start, place in OTHER_PACKAGES.items() if env_id.startswith(start)]
     if not found:
         return ""
@@ -89,7 +89,7 @@ def _hint(env_id: str) -> str:
 
 
 def _known(name: str, tasks: Mapping[str, str]) -> list[str]:
-    """What to suggest: an id for something that looks like an id, else our short names."""
+    """Names to suggest: ids if the name looks like an id, else our short names."""
     return [*tasks, *gym.registry] if "-v" in name or "/" in name else list(tasks)
 
 
@@ -99,10 +99,10 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: PlainMappi
     :param env_id: as registered
     :param n_envs: how many
     :param seed: environment ``i`` gets ``seed + i``
-    :param env_kwargs: for ``gymnasium.make``; ``subgoals`` goes to
+    :param env_kwargs: arguments of ``gymnasium.make``; ``subgoals`` goes to
         :class:`~sb3_tbc.tasks.generic.DescribedGoalEnv` instead (``low``, ``high``, ``thresholds``, ``names``)
-    :raises ConfigError: if it cannot be made, is no goal environment, its actions are not a Box, or it is told about
-        subgoals although it brings its own
+    :raises ConfigError: if it cannot be made, is not a goal environment, its actions are not a Box, or ``subgoals`` is
+        given for an environment that defines its own
     """
     try:
         kwargs = dict(env_kwargs or {})
@@ -121,7 +121,7 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: PlainMappi
 
 
 def _cause(error: Exception) -> str:
-    """Return one line: the message where there is one of use, else also kind and place."""
+    """Return one line: the message if it explains the error, else also the error's type and place."""
     if isinstance(error, (gym.error.Error, ImportError, TypeError, ValueError)) and str(error):
         return str(error)
     place = traceback.extract_tb(error.__traceback__)[-1]
@@ -130,14 +130,14 @@ def _cause(error: Exception) -> str:
 
 
 def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: Any) -> Env:
-    """Make one environment, able to draw itself where it can; a foreign goal environment gets a derived subgoal space.
+    """Make one environment, with pictures if it can draw them; a foreign goal environment gets a derived subgoal space.
 
-    Everything that needs an environment for an id makes it here: training, evaluation, films, the check of exports.
+    Training, evaluation, films and the check of exports all make their environments here.
 
-    :param env_id: as registered, with its module where it has one
-    :param subgoals: for :class:`~sb3_tbc.tasks.generic.DescribedGoalEnv`
-    :param env_kwargs: for ``gymnasium.make``
-    :raises ConfigError: if its module cannot be imported, or it is told about subgoals although it brings its own
+    :param env_id: as registered, with its module if it has one
+    :param subgoals: arguments of :class:`~sb3_tbc.tasks.generic.DescribedGoalEnv`
+    :param env_kwargs: arguments of ``gymnasium.make``
+    :raises ConfigError: if its module cannot be imported, or ``subgoals`` is given although it defines its own
     """
     module = env_id.rpartition(":")[0]
     if module:
@@ -149,9 +149,9 @@ def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: An
         env = gym.make(env_id, **env_kwargs)
     if hasattr(env.unwrapped, "subgoals"):
         if subgoals:
-            raise ConfigError(f"{env_id!r} brings its own subgoal space; leave out `subgoals`, got {dict(subgoals)}")
+            raise ConfigError(f"{env_id!r} defines its own subgoal space; leave out `subgoals`, got {dict(subgoals)}")
         return env
-    if goal_space_problems(env.observation_space, env.action_space):  # told by check_goal_env
+    if goal_space_problems(env.observation_space, env.action_space):  # check_goal_env reports them
         return env
     made_alike = repr((env.spec, sorted(env_kwargs.items()), sorted((subgoals or {}).items())))
     env = described = DescribedGoalEnv(env, description=_DESCRIPTIONS.get(made_alike), **(subgoals or {}))
@@ -160,7 +160,7 @@ def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: An
 
 
 def check_goal_env(env: VecEnv, env_id: str) -> None:
-    """Refuse what a hierarchical agent cannot act in.
+    """Refuse environments in which a hierarchical agent cannot act.
 
     :raises ConfigError: naming what is missing
     """

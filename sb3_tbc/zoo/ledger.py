@@ -1,4 +1,4 @@
-"""Run folders and the results ledger: small text files that say what was run, how, and what came out."""
+"""Run folders and the results ledger: small text files with the settings, command, versions and result of each run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import torch as th
@@ -70,7 +70,7 @@ class Episodes(Protocol):
 
 
 def summarise(result: Episodes) -> Plain:
-    """What ``evaluate --json`` and ``final.json`` say of an evaluation; undefined means are ``None``, never NaN.
+    """Summary of an evaluation for ``evaluate --json`` and ``final.json``; undefined means are ``None``, never NaN.
 
     ``outcomes`` has one digit per episode, in order, 1 for a success: the report pairs the episodes of two methods.
     """
@@ -117,7 +117,7 @@ def versions() -> Plain:
 
 
 def _commit() -> str | None:
-    """Commit of the checkout the package runs from, with ``+`` if files differ from it; ``None`` outside a checkout."""
+    """Commit of the checkout of the package, with ``+`` if files have changed; ``None`` outside a checkout."""
     folder = Path(__file__).parent
     try:
         where = ["git", "-C", str(folder)]
@@ -149,9 +149,9 @@ class RunFolder:
 
     @classmethod
     def for_run(cls, root: Path, task: str, algo: str, variant: str, seed: int) -> RunFolder:
-        """The folder a run belongs in; slashes and colons of environment ids become underscores.
+        """The folder of a run; slashes and colons of environment ids become underscores.
 
-        :raises ConfigError: if a name would lead out of ``root`` or is no name of a folder
+        :raises ConfigError: if a name would lead out of ``root`` or cannot name a folder
         """
         names = flat_name(task, "the task"), folder_name(algo, "the algorithm"), folder_name(variant, "the variant")
         return cls(root.joinpath(*names, folder_name(f"seed_{seed}", "the seed")))
@@ -168,7 +168,7 @@ class RunFolder:
 
     @property
     def checkpoint(self) -> Path:
-        """Folder with what ``--resume`` needs; the one before lies beside it, see :mod:`.checkpoints`."""
+        """Folder of the checkpoint for ``--resume``; the previous one lies beside it, see :mod:`.checkpoints`."""
         return self.path / NEWEST
 
     @property
@@ -188,19 +188,19 @@ class RunFolder:
 
     @property
     def resumable(self) -> bool:
-        """Whether there is an unfinished run that ``--resume`` goes on with."""
+        """Whether there is an unfinished run that ``--resume`` can continue."""
         return self.exists and not self.finished and (has_checkpoint(self.path) or self.model.is_file())
 
     def start(self, config: PlainMapping, command: str) -> None:
-        """Write what is known before training: versions, command, and the configuration, which makes it a run."""
+        """Write versions, command and configuration; a folder with a configuration counts as a run."""
         write_atomic(self.path / VERSIONS, to_json(versions()))
         write_atomic(self.path / COMMAND, command + "\n")
         write_atomic(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
 
     def clear(self) -> None:
-        """Remove the files of an earlier run, and nothing else that may lie in the folder.
+        """Remove the files of an earlier run, but nothing else in the folder.
 
-        First it stops to be a result, then a run, so that no half of it is ever taken for one.
+        The result goes first, then the configuration, so that remains are never taken for a run.
         """
         for name in (FINAL, CONFIG):
             (self.path / name).unlink(missing_ok=True)
@@ -211,12 +211,12 @@ class RunFolder:
             remove(path)
 
     def tidy(self) -> None:
-        """Remove what killed processes left half written."""
+        """Remove half-written files that killed processes left behind."""
         remove_unfinished(self.path)
         remove_temporary(self.path)
 
     def read_config(self) -> Plain:
-        """The configuration the run was started with.
+        """The configuration with which the run was started.
 
         :raises ConfigError: if there is none or it cannot be read
         """
@@ -235,16 +235,16 @@ class RunFolder:
 
     @property
     def command_line(self) -> str:
-        """The command the run was started with; empty if it is not known."""
+        """The command with which the run was started; empty if it is not known."""
         path = self.path / COMMAND
         return path.read_text(encoding="utf-8", errors="replace").strip() if path.is_file() else ""
 
     def reopen(self, timesteps: int) -> None:
-        """Put aside what a run that goes on from this step writes anew; a result that it had stays under its step."""
+        """Rename files that a run resumed from this step writes anew; an earlier result keeps its step in its name."""
         if self.finished:
             self._put_aside(FINAL, timesteps)
         self.drop_evaluations_after(timesteps)
-        self._put_aside("progress.csv", timesteps)  # SB3 begins it anew
+        self._put_aside("progress.csv", timesteps)  # SB3 starts a new one
 
     def _put_aside(self, name: str, timesteps: int) -> None:
         stem, _, suffix = name.partition(".")
@@ -257,7 +257,7 @@ class RunFolder:
             (self.path / name).rename(aside)
 
     def drop_evaluations_after(self, timesteps: int) -> None:
-        """Forget evaluations that a resumed run will make again."""
+        """Remove evaluations that a resumed run will repeat."""
         rows = self.read_evaluations()
         if any(row.timesteps > timesteps for row in rows):
             write_evaluations(self.evaluations, [row for row in rows if row.timesteps <= timesteps])
@@ -277,14 +277,14 @@ class RunFolder:
     def copy_to(self, target: RunFolder) -> None:
         """Copy the small text files, e.g. into the committed ledger.
 
-        :raises ConfigError: if another result lies there
+        :raises ConfigError: if it already holds a result
         """
         target.require_empty()
         for name in LEDGER_FILES:
             write_atomic(target.path / name, (self.path / name).read_text(encoding="utf-8"))
 
 
-def _read(path: Path, read: Callable[[Path], Any]) -> Plain:
+def _read(path: Path, read: Callable[[Path], object]) -> Plain:
     if not path.is_file():
         raise ConfigError(f"{path.parent} holds no run: {path.name} is missing")
     data = read(path)
@@ -294,7 +294,7 @@ def _read(path: Path, read: Callable[[Path], Any]) -> Plain:
 
 
 def curve_summary(rows: list[EvaluationRow]) -> Plain:
-    """Best evaluation and stability of a curve: share at 0.9 or more from the first such one on, and the worst."""
+    """Best evaluation and stability of a curve: from the first evaluation at 0.9 on, the share at 0.9 and the worst."""
     if not rows:
         return {"best_success_rate": None, "stable_share": None, "worst_after_first_90": None}
     rates = [row.success_rate for row in rows]

@@ -1,4 +1,4 @@
-"""One training run: make environments, build the agent, learn, evaluate, keep everything that matters."""
+"""One training run: make environments, build the agent, train, evaluate, and save everything in the run's folder."""
 
 from __future__ import annotations
 
@@ -36,27 +36,28 @@ from sb3_tbc.zoo.safety import CURE, ConsistentState, DivergenceCallback, check_
 def evaluation_seed(seed: int) -> int:
     """First seed of the evaluations during training.
 
-    Evaluation ``k`` adds ``1000 k``, its environment ``i`` adds ``i``. A million apart, no two training seeds share an
-    episode, and none is shared with the final evaluations. Environments take seeds below ``2**32``.
+    Evaluation ``k`` adds ``1000 k``, its environment ``i`` adds ``i``. The first seeds are a million apart, so no two
+    training seeds share an episode, nor do they share one with the final evaluations. Environments take seeds below
+    ``2**32``.
     """
     return (100_000_000 + 1_000_000 * seed) % 2**32
 
 
 def final_seed(seed: int) -> int:
-    """Seed of the evaluation after training; a thousand apart, no two training seeds share an episode."""
+    """Seed of the evaluation after training; they are a thousand apart, so no two training seeds share an episode."""
     return (2_000_000 + 1_000 * seed) % 2**32
 
 
 @dataclass(frozen=True)
 class RunSpec:
-    """A run: what is trained (:class:`RunConfig`), on which seed, and how it is watched.
+    """A run: what is trained (:class:`RunConfig`), on which seed, and how it is evaluated.
 
     :param run: algorithm, task, settings
     :param env_id: environment id of the task
-    :param variant: folder name: ``full``, an ablation, or a name of the user's
-    :param seed: of everything in training
+    :param variant: folder name: ``full``, an ablation, or a name given by the user
+    :param seed: seed of everything in training
     :param eval_freq: environment steps between evaluations
-    :param n_eval_episodes: episodes of each of them
+    :param n_eval_episodes: episodes per evaluation
     :param n_final_episodes: episodes of the evaluation after training
     """
 
@@ -69,7 +70,7 @@ class RunSpec:
     n_final_episodes: int = 100
 
     def to_dict(self) -> Plain:
-        """As plain data for ``config.yml``; the run's own keys come first."""
+        """Return plain data for ``config.yml``; the run's own keys come first."""
         watching = {k: v for k, v in asdict(self).items() if k != "run"}
         run = self.run.to_dict()
         model = run.pop("model")
@@ -77,7 +78,7 @@ class RunSpec:
 
     @classmethod
     def from_dict(cls, data: Plain) -> RunSpec:
-        """Back from ``config.yml``.
+        """Build the run from the data of ``config.yml``.
 
         :raises ConfigError: if keys are missing or unknown
         """
@@ -90,7 +91,7 @@ class RunSpec:
 
     @property
     def identity(self) -> Plain:
-        """What names a result in ``final.json`` and inside the agent's ``.zip``."""
+        """What identifies a result in ``final.json`` and inside the agent's ``.zip``."""
         run = self.run
         return {
             "task": run.task,
@@ -105,18 +106,18 @@ class RunSpec:
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a run is carried out, which does not change its result.
+    """How a run is carried out; these options do not change its result.
 
     :param device: torch device
     :param progress: show a progress bar
     :param verbose: print a line per evaluation
     :param tensorboard: write TensorBoard files into the run folder
     :param trace: write ``options.csv``
-    :param checkpoint_seconds: time between checkpoints; infinite for none, but for the one when stopped
+    :param checkpoint_seconds: time between checkpoints; with infinity the only one is that of a stopped run
     :param keep_checkpoint: keep the last checkpoint (with replay buffers) of a finished run
-    :param save_at_end: save a checkpoint when training is stopped, or ended by a fault of an environment
+    :param save_at_end: save a checkpoint when training is stopped or an environment fails
     :param trust: whether a checkpoint may run code, see :func:`.load_model`
-    :param stop: tells whether the user asked to stop; training stops at the next point to go on from
+    :param stop: tells whether the user asked to stop; training stops at the next point from which it can be resumed
     """
 
     device: str = "cpu"
@@ -132,12 +133,12 @@ class RunOptions:
 
 
 def evaluation_envs(env_id: str, n_episodes: int, seed: int, env_kwargs: Plain) -> VecEnv:
-    """Environments for evaluations: up to ten side by side, because acting costs the same for ten as for one."""
+    """Parallel environments for evaluations, at most ten: acting costs about the same for ten as for one."""
     return make_envs(env_id, min(10, n_episodes), seed, env_kwargs)
 
 
 class Interrupted(Exception):
-    """Training was stopped by the user; what it goes on from lies in ``folder``."""
+    """Training was stopped by the user; ``folder`` holds the checkpoint to resume from."""
 
     def __init__(self, message: str, folder: Path) -> None:
         super().__init__(message)
@@ -154,8 +155,8 @@ def start_run(
 ) -> Plain:
     """Train from the beginning and return the content of ``final.json``.
 
-    :param after_eval: called after each evaluation, e.g. by a search that may give the run up
-    :raises ConfigError: for a user's mistake, before anything is written, and if the folder holds a run
+    :param after_eval: called after each evaluation, e.g. by a search that may stop the run
+    :raises ConfigError: for a user's mistake, before anything is written, and if the folder already holds a run
     :raises WriteError: if the folder cannot be written, or the disk is full
     :raises Interrupted: when stopped, after the checkpoint is written
     :raises TrainingError: if an environment fails or learning diverges
@@ -183,12 +184,12 @@ def _check_new(folder: RunFolder, overwrite: bool) -> None:
 
 
 def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None = None) -> Plain:
-    """Go on from the last whole checkpoint of a run, or evaluate it where only that was left to do.
+    """Resume a run from its last undamaged checkpoint, or evaluate it if only that is missing.
 
-    A finished run has nothing left to do: its result is returned, so that a script may resume until all is done.
+    Of a finished run the result is returned, so that a script can call this until all runs are done.
 
     :param n_timesteps: a new total of environment steps
-    :raises ConfigError: if there is no checkpoint or nothing is left to do
+    :raises ConfigError: if there is no checkpoint, or the run is beyond ``n_timesteps``
     :raises WriteError: if the folder cannot be written, or the disk is full
     :raises Interrupted: when stopped, after the checkpoint is written
     :raises TrainingError: if an environment fails or learning diverges
@@ -207,12 +208,12 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
 
 
 def _trained(folder: RunFolder) -> int:
-    """Steps of the agent at the end of training; 0 where training has not ended."""
+    """Steps of the agent at the end of training; 0 if training has not ended."""
     if not folder.model.is_file():
         return 0
     try:
         steps = read_zip(folder.model).get("num_timesteps")
-    except ConfigError:  # damaged: training goes on from its checkpoint
+    except ConfigError:  # damaged: training resumes from its checkpoint
         return 0
     return steps if isinstance(steps, int) else 0
 
@@ -231,7 +232,7 @@ def _only_evaluate(spec: RunSpec, folder: RunFolder, options: RunOptions) -> Pla
 def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> Plain:
     checkpoint = find_checkpoint(folder.path)
     if checkpoint is None:
-        again = "start with --keep-checkpoint to go on after the end"
+        again = "start it with --keep-checkpoint to be able to extend a finished run"
         cure = again if folder.finished else "start it again with --overwrite"
         raise ConfigError(f"{folder.path} has no checkpoint to resume from; {cure}")
     done = checkpoint.timesteps
@@ -258,9 +259,9 @@ def _load_replay(model: Agent, path: Path) -> None:
 
 
 class Training:
-    """Training of an agent into a run's folder, whatever happens.
+    """Trains an agent and writes all files of the run, also when training is stopped or fails.
 
-    :param earlier: seconds that earlier parts of the run took
+    :param earlier: wall time of earlier parts of the run, seconds
     :param after_eval: called after each evaluation
     """
 
@@ -308,7 +309,7 @@ class Training:
         return finish(model, spec, self.folder, self.options, self.evaluations.wall_time)
 
     def checkpoint(self, save_replay: Callable[[Path], object] | None = None) -> None:
-        """Save all that the run goes on from."""
+        """Save everything that is needed to resume the run."""
         check_weights(self.model)
         if self.trace is not None:
             self.trace.flush()
@@ -316,7 +317,7 @@ class Training:
         save_checkpoint(self.folder.path, steps, self.evaluations.wall_time, self.model.save, replay)
 
     def _train(self) -> None:
-        """Learn; whatever ends that early is told in one line, with what there is to go on from."""
+        """Train; an early end gives a message of one line that also names the checkpoint to resume from."""
         options, wanted = self.options, self.spec.run.n_timesteps
         callbacks = [
             DivergenceCallback(),
@@ -337,7 +338,7 @@ class Training:
             if options.save_at_end:
                 self.checkpoint()
             raise Interrupted(f"stopped at {self.model.num_timesteps} of {wanted} steps", self.folder.path) from stop
-        except OSError as error:  # SB3's progress.csv raises the system's own
+        except OSError as error:  # writing SB3's progress.csv raises OSError itself
             told = error if isinstance(error, WriteError) else f"cannot write {self.folder.path}: {error.strerror}"
             raise WriteError(f"{told}. {self._what_is_left()}") from error
         except EnvironmentFault as error:
@@ -359,7 +360,7 @@ class Training:
         )
 
     def _save_before(self) -> bool:
-        """Save the last point to go on from, if nothing has been learned since; whether that was done."""
+        """Save the state at the start of the rollout, if nothing was learned since; True if it was saved."""
         replay = self.consistent.go_back() if self.options.save_at_end else None
         if replay is None:
             return False
@@ -385,7 +386,7 @@ NOT_A_DISTRIBUTION = "to satisfy the constraint"
 
 
 def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, trained: float) -> Plain:
-    """Evaluate the trained agent, write the result, and only then remove what a resumed run would have needed.
+    """Evaluate the trained agent, write the result, and only then remove the checkpoints.
 
     :param trained: seconds that training took
     """

@@ -1,4 +1,4 @@
-"""What keeps a run's last good state: noticing divergence, and remembering the last point to go on from."""
+"""Keeps a run's last good state: detects divergence, and remembers the last point from which it can be resumed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from sb3_tbc.tbc_hrl.flat_replay import Rewind, TerminatingHerReplayBuffer
 from sb3_tbc.tbc_hrl.flat_sac import CYCLE, FlatSAC
 
 DIVERGED = 1e12
-"""Critic loss beyond all sense: values of a million, where returns are of the order of 10 to 1000."""
+"""Critic loss at which training has diverged: values of about a million, while returns are 10 to 1000."""
 CURE = "a lower learning rate or rewards of smaller scale usually cure it"
 
 
@@ -35,7 +35,7 @@ class LossWatch(KVWriter):
         self.reason = ""
 
     def write(self, key_values: Plain, key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        """Look at the critics' losses of one dump."""
+        """Check the critics' losses in one set of logged values."""
         for key, value in key_values.items():
             if key.endswith("critic_loss") and not self.reason and not abs(float(value)) < self.limit:
                 self.reason = f"diverging: {key} is {value:.3g} at step {step:,}"
@@ -45,7 +45,7 @@ class LossWatch(KVWriter):
 
 
 def check_weights(model: BaseAlgorithm) -> None:
-    """Refuse to keep an agent whose weights are no numbers any more.
+    """Refuse to save an agent whose weights are NaN or infinite.
 
     :raises DivergedError: naming the first such tensor
     """
@@ -55,9 +55,9 @@ def check_weights(model: BaseAlgorithm) -> None:
 
 
 class DivergenceCallback(BaseCallback):
-    """Ends training when the critics' losses leave all sense.
+    """Ends training when a critic's loss exceeds a limit.
 
-    :param limit: the loss that does
+    :param limit: critic loss at which training ends
     """
 
     def __init__(self, limit: float = DIVERGED) -> None:
@@ -77,7 +77,7 @@ class DivergenceCallback(BaseCallback):
 
 
 class ConsistentState(BaseCallback):
-    """Remembers the last point to go on from, so that a fault of an environment in mid-rollout loses that rollout only.
+    """Remembers the state at the start of a rollout, so that an environment's failure loses that rollout only.
 
     While steps are collected no weights change, and of replay only what is added, so that all that must be remembered
     is small. From the end of a rollout to the beginning of the next, updates run, and nothing is remembered.
@@ -114,7 +114,7 @@ class ConsistentState(BaseCallback):
 
     @staticmethod
     def _rows(model: TBCHRL) -> tuple[int, ...]:
-        """How much replay there is: an episode may be stored already when a callback fails."""
+        """Fill of the replay buffers: an episode may have been stored before a callback fails."""
         return tuple(place for buffer in model.replay_buffer for place in (buffer.size(), buffer.pos))
 
     def go_back(self) -> Callable[[Path], None] | None:

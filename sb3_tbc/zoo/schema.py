@@ -1,13 +1,13 @@
-"""What a configuration may contain: the settings of each algorithm, and what the runner reads itself."""
+"""What a configuration may contain: the settings of each algorithm, and the keys of the runner."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal, overload
 
-from sb3_tbc.aliases import Plain
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.settings import NotEmpty, Range, Settings, hints, read_partial
 from sb3_tbc.tbc_hrl.config import FlatConfig, HACConfig, HiTSConfig, TBCConfig
@@ -27,7 +27,7 @@ _FLOAT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 @dataclass(frozen=True, kw_only=True)
 class SubgoalKeys(Settings):
-    """Subgoals of an environment that does not bring its own; see :mod:`sb3_tbc.tasks.generic`."""
+    """Subgoals of an environment that does not define its own; see :mod:`sb3_tbc.tasks.generic`."""
 
     low: Numbers | None = None
     """Lower bounds of a subgoal."""
@@ -38,7 +38,7 @@ class SubgoalKeys(Settings):
     names: tuple[str, ...] | None = None
     """A name for each coordinate."""
     n_probe_steps: Annotated[int, Range(1, 10_000_000)] | None = None
-    """Random steps that bounds and scales are measured in."""
+    """Number of random steps in which bounds and scales are measured."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ RUN = ("n_timesteps", "n_envs", "env_kwargs")
 def kinds_of(algo: str | None) -> Plain:
     """Every key that a section of an algorithm's configuration may have, and its type.
 
-    :param algo: name of the algorithm; None, or a name that is not known, allows the settings of any
+    :param algo: name of the algorithm; None or an unknown name allows the settings of all
     """
     classes = [CONFIG_CLASSES[algo]] if algo in CONFIG_CLASSES else [FlatConfig, TBCConfig]
     kinds = hints(RunKeys)
@@ -73,7 +73,11 @@ def kinds_of(algo: str | None) -> Plain:
     return kinds
 
 
-def coerce(value: Any) -> Any:
+@overload
+def coerce(value: PlainMapping) -> Plain: ...
+@overload
+def coerce(value: object) -> object: ...
+def coerce(value: object) -> object:
     """Turn number-like strings into numbers, recursively: YAML 1.1 reads ``3e-4`` as text."""
     if isinstance(value, Mapping):
         return {key: coerce(item) for key, item in value.items()}
@@ -84,11 +88,11 @@ def coerce(value: Any) -> Any:
     return value
 
 
-def validate(section: Any, algo: str | None, where: str) -> Plain:
-    """Check every key and value of a section and return it with whole floats as integers where those are asked for.
+def validate(section: object, algo: str | None, where: str) -> Plain:
+    """Check every key and value of a section and return it, with whole floats as integers where integers are expected.
 
-    :param section: what was read, numbers already coerced
-    :param algo: whose settings they are, see :func:`kinds_of`
+    :param section: the section as read from the file, numbers already coerced
+    :param algo: algorithm whose settings are allowed, see :func:`kinds_of`
     :param where: file and section, for messages
     :raises ConfigError: for an unknown key or a value that is not allowed
     """

@@ -9,7 +9,6 @@ import sys
 import textwrap
 from collections.abc import Mapping
 from itertools import groupby
-from typing import Any
 
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.settings import Entry, Settings, entries
@@ -52,7 +51,7 @@ python -m sb3_tbc.train --hyperparams max_options:10 low.learning_rate:1e-3 low.
 ```
 
 In a section only what differs from the default has to be given. The default stands in brackets; `null` in YAML is
-`None` in Python. A value that a setting cannot have is refused, and the message says what it may be.
+`None` in Python. A value that is not allowed is refused, and the message names the allowed ones.
 `python -m sb3_tbc.train --help-settings` prints all this in the terminal (with `--algo hits` and so on for another
 algorithm). What the shipped configurations set for each task is in the folder `zoo_configs`.
 """
@@ -69,7 +68,7 @@ def chosen(algo: str) -> type[Settings]:
 
 
 def settings_text(algo: str = "tbc-hrl", width: int = 100) -> str:
-    """All settings of an algorithm for a terminal: name and default, then what it does and what it may be."""
+    """All settings of an algorithm for a terminal: name and default, then what it does and which values are allowed."""
     lines = [f"Settings of {NAMES[algo]}, for --hyperparams NAME:VALUE and configuration files", ""]
     for entry in [*entries(RunKeys), *entries(chosen(algo))]:
         lines.append(entry.name if entry.default is None else f"{entry.name}: {entry.default}")
@@ -78,11 +77,11 @@ def settings_text(algo: str = "tbc-hrl", width: int = 100) -> str:
     return "\n".join(lines)
 
 
-def settings_markdown(classes: Mapping[str, type[Any]] = CONFIG_CLASSES) -> str:
+def settings_markdown(classes: Mapping[str, type[Settings]] = CONFIG_CLASSES) -> str:
     """The settings page of the documentation.
 
-    :param classes: algorithm -> settings class; the first one is told in full, of the others what differs from it, or
-        all where they share nothing with it
+    :param classes: algorithm -> settings class; the first one is listed in full, of the others only different
+        defaults, or everything if they have settings that the first has not
     """
     first, *others = classes
     told = entries(classes[first])

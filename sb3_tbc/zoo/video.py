@@ -1,4 +1,4 @@
-"""Videos of an agent at work, with the live subgoal and the remaining time drawn in. Needs the ``video`` extra."""
+"""Videos of an agent's episodes, with the live subgoal and the remaining time drawn in. Needs the ``video`` extra."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.aliases import Env
+from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.tasks.probe import said_success
@@ -25,6 +25,13 @@ OUTCOME_SECONDS = 1.5
 """How long the last picture of an episode stays, so that its outcome can be read."""
 
 
+class _Writer(Protocol):
+    """The part of imageio's writer that is used here."""
+
+    def append_data(self, frame: Frame) -> None:
+        """Add a frame."""
+
+
 def film(model: Agent, env: Env, seed: int | None = None) -> Iterator[Frame]:
     """The frames of :func:`episode_frames`, the last one held for :data:`OUTCOME_SECONDS`."""
     frame = None
@@ -36,7 +43,7 @@ def film(model: Agent, env: Env, seed: int | None = None) -> Iterator[Frame]:
 
 
 def frames_per_second(env: Env) -> float:
-    """How many steps of a task take a second."""
+    """How many steps of the task make up one second of video."""
     return float(env.metadata.get("render_fps", 30))
 
 
@@ -48,7 +55,7 @@ def episode_frames(model: Agent, env: Env, seed: int | None = None) -> Iterator[
 
     :param model: a trained agent
     :param env: a task with ``render_mode="rgb_array"``
-    :param seed: of the reset
+    :param seed: seed of the reset
     """
     observation, _ = env.reset(seed=seed)
     state, start, over, result = None, np.array([True]), False, "time limit"
@@ -71,27 +78,28 @@ def episode_frames(model: Agent, env: Env, seed: int | None = None) -> Iterator[
 
 
 def _pursuit(model: TBCHRL, live: TwoLevelState) -> Overlay:
-    """What an agent pursues in the coming step."""
+    """Subgoal and remaining time of the coming step."""
     left = live.time_budget - live.elapsed + 1
     text = f"option {live.used[0]} of {model.config.max_options}"
     return Overlay(live.subgoal[0], float(model.rules.remaining(left)[0]), text, max(math.ceil(left[0]), 0))
 
 
-def _frame(env: Env, shown: Overlay, observation: Any) -> Frame:
+def _frame(env: Env, shown: Overlay, observation: PlainMapping) -> Frame:
     draws_itself = hasattr(env.unwrapped, "set_overlay")
     if draws_itself:
         env.unwrapped.set_overlay(*shown)  # type: ignore[attr-defined]
     try:
-        picture: Any = env.render()
+        rendered = env.render()
     except Exception as error:  # An environment's own code may fail in any way.
         cure = "" if "MUJOCO_GL" in str(error) else "; without a display, set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
         raise ConfigError(f"the environment cannot be drawn: {error}{cure}") from error
-    if not isinstance(picture, np.ndarray):
-        raise ConfigError(f"the environment cannot be drawn: render() gave {picture!r}, not an array; see render_mode")
+    if not isinstance(rendered, np.ndarray):
+        raise ConfigError(f"the environment cannot be drawn: render() gave {rendered!r}, not an array; see render_mode")
+    picture = rendered
     if not draws_itself:
         picture = with_caption(picture, shown, np.asarray(observation["desired_goal"], dtype=np.float64))
     height, width = picture.shape[:2]
-    frame: Frame = picture[: height - height % 2, : width - width % 2]  # the codec wants even sizes
+    frame: Frame = picture[: height - height % 2, : width - width % 2]  # the codec needs even sizes
     return frame
 
 
@@ -101,7 +109,7 @@ def record_video(model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: 
     :param model: a trained agent
     :param env: a task with ``render_mode="rgb_array"``
     :param path: the file, ending in ``.mp4``
-    :param n_episodes: how many
+    :param n_episodes: number of episodes
     :param seed: episode ``i`` starts from ``seed + i``
     :raises ConfigError: if the file's name, the installation or the task do not allow it
     """
@@ -112,7 +120,7 @@ def record_video(model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: 
     temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
     fps = frames_per_second(env)
     try:
-        writer: Any
+        writer: _Writer
         with imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
             for episode in range(n_episodes):
                 for frame in film(model, env, seed + episode):

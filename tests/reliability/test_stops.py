@@ -68,7 +68,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(
     assert not differences(undisturbed, finish(tmp_path / "runs", arguments, tmp_path / "log"))
     for path in (*folder.glob("checkpoint*/state.json"),):
         path.write_text("{}")
-    with pytest.raises(ConfigError, match=r"no whole checkpoint: .*state.json is damaged"):
+    with pytest.raises(ConfigError, match=r"no undamaged checkpoint: .*state.json is damaged"):
         find_checkpoint(folder)
 
 

@@ -1,4 +1,4 @@
-"""A stranger's agent file: loading it runs nothing that it brings along, unless the user says that it is trusted."""
+"""Loading an untrusted agent file runs no code from that file, unless the user says that it is trusted."""
 
 from __future__ import annotations
 

@@ -194,7 +194,7 @@ def test_number_like_strings_become_numbers(tmp_path: Path) -> None:
         ("T: {low: 3}", r"low must be a section"),
         ("T: 3", r"expected sections"),
         ("T: {a: [}", r"cannot read .*a\.yml: it is no YAML"),
-        ("T: {subgoals: {thresholds: 0.1}}", r"neither section T nor section default of .*a\.yml says n_timesteps"),
+        ("T: {subgoals: {thresholds: 0.1}}", r"neither section T nor section default of .*a\.yml gives n_timesteps"),
         ("T: {n_timesteps: 0}", r"n_timesteps must be a whole number from 1 to"),
     ],
 )

@@ -122,7 +122,7 @@ def test_subgoals_that_do_not_fit(given: dict[str, Any], message: str) -> None:
 
 
 def test_a_task_keeps_its_own_subgoals() -> None:
-    with pytest.raises(ConfigError, match="brings its own subgoal space"):
+    with pytest.raises(ConfigError, match="defines its own subgoal space"):
         make_envs("sb3_tbc/Pendulum-v0", 1, 0, {"subgoals": {"thresholds": 0.1}})
 
 
