@@ -14,7 +14,7 @@ from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, Exporte
 
 
 def to_c(policy: ExportedPolicy) -> str:
-    """Source text of the policy; its head says how it is used.
+    """Source text of the policy; the comment at its beginning explains its use.
 
     :param policy: what to export
     """
@@ -83,12 +83,12 @@ def floats(values: FloatArray) -> str:
 
 
 def array(name: str, values: FloatArray, kind: str = "tbc_real") -> str:
-    """A constant array of single-precision numbers, in the precision of what is computed with them: that is faster."""
+    """A constant array of single-precision numbers, stored in the type of the computation, which is faster."""
     return f"static const {kind} {name}[{max(1, np.size(values))}] = {{{floats(values) or '0.0f'}}};\n"
 
 
 def exact(name: str, values: FloatArray) -> str:
-    """A constant array of products, which single precision would round."""
+    """A constant array in double precision, for products that single precision would round."""
     listed = ", ".join(repr(float(v)) for v in np.asarray(values, np.float64).ravel())
     return f"static const tbc_real {name}[{max(1, np.size(values))}] = {{{listed or '0.0'}}};\n"
 
@@ -102,7 +102,7 @@ def _indices(name: str, values: NDArray[np.integer]) -> str:
 def _sparse(
     name: str, matrix: FloatArray, columns: dict[str, FloatArray], write: Callable[[str, FloatArray], str] = array
 ) -> str:
-    """Compressed rows by postsynaptic neuron: where rows begin, presynaptic indices, and one array per column set."""
+    """Compressed rows by postsynaptic neuron: start of each row, presynaptic indices, one array per set of values."""
     present = matrix.T != 0
     post, pre = np.nonzero(present)
     begin = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
@@ -111,7 +111,7 @@ def _sparse(
 
 
 def _circuit_code(c: Circuit) -> str:
-    """The functions of a circuit: lines between ``@PAPER@`` or ``@LEAN@`` and ``@END@`` belong to that kind alone."""
+    """The functions of a circuit; lines from ``@PAPER@`` or ``@LEAN@`` to ``@END@`` are kept only for that kind."""
     kept, other = ("LEAN", "PAPER") if c.lean else ("PAPER", "LEAN")
     text = re.sub(rf"@{other}@\n.*?@END@\n", "", _template("circuit.c"), flags=re.DOTALL)
     return re.sub(rf"@(?:{kept}|END)@\n", "", text)

@@ -1,4 +1,4 @@
-"""Playing an exported policy beside the agent it came from, and what it costs on a microcontroller."""
+"""Compares an exported policy with its agent, and measures its size on a microcontroller."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ import numpy as np
 from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.export.policy import Circuit, ExportedPolicy
+from sb3_tbc.export.policy import Circuit, ExportedPolicy, action_box
 from sb3_tbc.extras import require
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.tbc_hrl import TBCHRL
@@ -27,7 +27,7 @@ from sb3_tbc.zoo.environments import make_env
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
 CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=c99")
 CLOSED_FORM_TOLERANCE = 0.05
-"""Larger differences of actions, as a share of half their range, draw a warning."""
+"""Difference of actions, as a share of half their range, above which a warning is printed."""
 
 Observation = Mapping[str, AnyArray]
 
@@ -102,7 +102,7 @@ class CPlayer:
     """Compiles an exported C file with all warnings as errors, and plays it.
 
     :param path: the C file
-    :param policy: what it was exported from, for the sizes
+    :param policy: the exported policy, for the sizes
     :param flags: further compiler options
     :raises ConfigError: if there is no C compiler
     """
@@ -133,7 +133,7 @@ class CPlayer:
         return self._action.copy()
 
     def low_step_seconds(self, closed_form: bool = False, calls: int = 200) -> float:
-        """Seconds per low-level step at best, the price of the call from Python taken off."""
+        """Shortest time of a low-level step, seconds, without the call from Python."""
         membrane = np.zeros(self.policy.state_dim + 1, np.float32)
         seen, mean = np.full(self.policy.n_low_inputs, 0.3, np.float32), np.zeros_like(self._action)
         pointers = [part.ctypes.data_as(ctypes.c_void_p) for part in (membrane, seen, mean)]
@@ -162,7 +162,7 @@ class Score(NamedTuple):
 
 
 class CheckResult(NamedTuple):
-    """What a comparison found."""
+    """Result of a comparison."""
 
     steps: int
     episodes: int
@@ -179,7 +179,7 @@ class CheckResult(NamedTuple):
 
 
 class ClosedFormResult(NamedTuple):
-    """The closed form beside the agent on the states the agent meets, and what each achieves alone."""
+    """Comparison of the closed form with the agent: actions on the agent's states, and success when each acts alone."""
 
     beside: CheckResult
     alone: Score
@@ -200,8 +200,8 @@ class ClosedFormResult(NamedTuple):
             return text
         return (
             f"{text}\nWARNING: the closed form does not act as this agent does (rms {self.share:.0%} of half the range "
-            "of actions): deploy the integrated form. Agents that carry their potentials on (memory window or episode) "
-            "come closer to it than those that start every step from rest."
+            "of actions): deploy the integrated form. It fits agents better that keep their potentials (memory "
+            "window or episode) than agents that start every step from rest."
         )
 
 
@@ -215,16 +215,16 @@ def player(kind: str, path: Path, policy: ExportedPolicy) -> Player:
 def check(
     model: TBCHRL, policy: ExportedPolicy, kind: str, path: Path, info: PlainMapping, steps: int, seed: int
 ) -> str:
-    """Play the exported policy beside ``predict(deterministic=True)`` on the observations the agent meets.
+    """Compare the exported policy with ``predict(deterministic=True)`` on the observations of the agent's episodes.
 
     :param model: the agent
-    :param policy: what was exported
+    :param policy: the exported policy
     :param kind: ``"onnx"``, ``"c"`` or ``"numpy"``
     :param path: the exported file
     :param info: ``env_id`` and ``env_kwargs`` of the task
     :param steps: environment steps; episodes follow one another
-    :param seed: of the first episode
-    :return: what to print: the comparison, how well a circuit's closed form does, and the time of a step in C
+    :param seed: seed of the first episode
+    :return: text to print: the comparison, also of a circuit's closed form, and the time of a step in C
     """
     env = make_env(info["env_id"], **(info.get("env_kwargs") or {}))
     exported = player(kind, path, policy)
@@ -240,7 +240,7 @@ def check(
 
 
 def compare(model: TBCHRL, exported: Player, env: Env, steps: int, seed: int = 0) -> CheckResult:
-    """The comparison itself, see :func:`check`."""
+    """Compare the actions of an exported policy with the agent's, see :func:`check`."""
     beside = _Beside(model, exported)
     score = play(beside, env, steps, seed)
     difference = np.abs(beside.differences)
@@ -251,18 +251,18 @@ def compare(model: TBCHRL, exported: Player, env: Env, steps: int, seed: int = 0
 def compare_closed_form(
     model: TBCHRL, exported: CPlayer | NumpyPlayer, env: Env, steps: int, seed: int = 0
 ) -> ClosedFormResult:
-    """The closed form of an exported circuit beside the agent, and then alone."""
+    """Compare the closed form of an exported circuit with the agent, then let it act alone."""
     exported.closed_form = True
     exported.reset()
     beside = compare(model, exported, env, steps, seed)
     exported.reset()
-    actions: Any = model.action_space
+    actions = action_box(model)
     half_range = 0.5 * float(np.max(actions.high - actions.low))
     return ClosedFormResult(beside, play(exported, env, steps, seed), half_range)
 
 
 def play(who: Player, env: Env, steps: int, seed: int = 0) -> Score:
-    """Let a player act for some steps; episodes follow one another, the last one is cut."""
+    """Let a player act for some steps; episodes follow one another, and the last one may be incomplete."""
     observation, _ = env.reset(seed=seed)
     finished = successes = 0
     for _ in range(steps):
@@ -275,7 +275,7 @@ def play(who: Player, env: Env, steps: int, seed: int = 0) -> Score:
 
 
 class _Beside:
-    """A player that acts as the agent does and notes how far an exported policy would have differed."""
+    """A player that acts as the agent and records the differences of the exported policy's actions."""
 
     def __init__(self, model: TBCHRL, exported: Player) -> None:
         self.model, self.exported = model, exported
@@ -298,7 +298,7 @@ class _Beside:
 
 
 class Cortex(NamedTuple):
-    """Bytes on a Cortex-M4 of the low level alone."""
+    """Size of the low level on a Cortex-M4, bytes."""
 
     flash: int  # code and constants, without the mathematical library
     library: int  # expf and tanhf, as linked
@@ -337,7 +337,7 @@ def cortex_m4_report(path: Path) -> str:
 
 
 def _linked(run: list[str], folder: Path, source: Path) -> int:
-    """Flash of a linked program with the low level, less that of an empty one."""
+    """Flash of a linked program with the low level, minus that of an empty program."""
     call = "static volatile float m[TBC_STATE + 1], s[TBC_LOW_INPUT], a[TBC_ACTION];\n"
     call += "int main(void) { tbc_low_mean((float *)m, (const float *)s, (int)m[0], (float *)a); return 0; }\n"
     programs = {"full": f'#include "{source.name}"\n{call}', "empty": "int main(void) { return 0; }\n"}

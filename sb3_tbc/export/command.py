@@ -30,10 +30,10 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--format", choices=sorted(SUFFIXES), required=True, help="what to write")
     parser.add_argument("--output", type=Path, help="file to write; by default beside the model, with another suffix")
-    parser.add_argument("--check", type=positive_int, metavar="STEPS", help="play this many steps with the agent and "
-                        "with the exported policy, and say how much their actions differ")  # fmt: skip
-    parser.add_argument("--env", help="where --check plays; by default the task the agent was trained on")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes that --check plays")
+    parser.add_argument("--check", type=positive_int, metavar="STEPS", help="act for this many steps with the agent "
+                        "and with the exported policy, and print how much their actions differ")  # fmt: skip
+    parser.add_argument("--env", help="environment for --check; by default the task on which the agent was trained")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes of --check")
     add_trust(parser)
     return parser
 
@@ -77,7 +77,7 @@ def describe(policy: ExportedPolicy) -> str:
 def command(argv: Sequence[str]) -> int:
     """Export; see ``--help``."""
     args = build_parser().parse_args(argv)
-    if args.format == "onnx":  # told before the agent is loaded
+    if args.format == "onnx":  # report it before the agent is loaded
         require("onnx", extra="export", what="--format onnx")
     model = load_two_levels(args.model, trust=args.trust)
     name = args.model.with_suffix(SUFFIXES[args.format])
@@ -96,7 +96,7 @@ def command(argv: Sequence[str]) -> int:
         info = identify(args.model, args.env, args.trust)
         print(check(model, policy, args.format, path, info, args.check, args.seed))
     elif isinstance(policy.low, Circuit) and args.format != "onnx":
-        print("closed form: not compared with the agent; measure it before you use it, with --check STEPS")
+        print("closed form: not compared with the agent; before you use it, compare it with --check STEPS")
     return 0
 
 

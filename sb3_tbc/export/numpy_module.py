@@ -1,4 +1,4 @@
-"""The policy as one Python file that needs NumPy alone."""
+"""The policy as one Python file that needs only NumPy."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import base64
 import io
 from dataclasses import replace
 from importlib.resources import files
-from typing import Any
 
 import numpy as np
 
@@ -49,27 +48,27 @@ def to_numpy_module(policy: ExportedPolicy) -> str:
 
 
 def _with_silent_sensory(c: Circuit) -> Circuit:
-    """A lean circuit in the paper's form, its sensory synapses of no conductance: one runtime computes both."""
+    """A lean circuit in the paper's form, with sensory synapses of zero conductance, so that one runtime suffices."""
     silent = np.zeros(len(c.input_gain), np.float32)
     rows = np.zeros((len(silent), c.from_inputs.shape[1]), np.float32)
     return replace(c, sensory_gain=silent, sensory_threshold=silent, from_inputs=np.concatenate([rows, c.from_inputs]))
 
 
-def _sort(name: str, value: Any, arrays: Plain, settings: Plain) -> None:
-    """Arrays to the archive, everything else to the settings."""
+def _sort(name: str, value: object, arrays: Plain, settings: Plain) -> None:
+    """Put arrays into the archive, everything else into the settings."""
     if isinstance(value, np.ndarray):
         arrays[name] = value
     elif isinstance(value, tuple) and value and isinstance(value[0], np.ndarray):
         arrays.update({f"{name}.{i}": array for i, array in enumerate(value)})
         settings[f"{name}.count"] = len(value)
-    elif name == "achieved":
+    elif name == "achieved" and isinstance(value, tuple):
         settings[name] = [_finite(tuple(c)) for c in value]
     else:
         settings[name] = _finite(value) if isinstance(value, tuple) else value
 
 
-def _finite(values: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Infinities as text that Python reads back."""
+def _finite(values: tuple[object, ...]) -> tuple[object, ...]:
+    """Replace infinities by values whose text Python can read."""
     return tuple(_Inf(v) if isinstance(v, float) and np.isinf(v) else v for v in values)
 
 

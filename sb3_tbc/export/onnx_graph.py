@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import onnx
+from numpy.typing import ArrayLike, DTypeLike
 from onnx import TensorProto, helper, numpy_helper
 
 from sb3_tbc.arrays import FloatArray
@@ -24,18 +24,18 @@ class _Graph:
         self.nodes: list[onnx.NodeProto] = []
         self.constants: dict[str, onnx.TensorProto] = {}
 
-    def constant(self, value: Any, dtype: Any = np.float32) -> str:
+    def constant(self, value: ArrayLike, dtype: DTypeLike = np.float32) -> str:
         array = np.asarray(value, dtype=dtype)
         name = f"c{len(self.constants)}"
         self.constants[name] = numpy_helper.from_array(array, name)
         return name
 
-    def __call__(self, op: str, *inputs: str, name: str | None = None, **attributes: Any) -> str:
+    def __call__(self, op: str, *inputs: str, name: str | None = None, **attributes: int | Sequence[int]) -> str:
         output = name or f"t{len(self.nodes)}"
         self.nodes.append(helper.make_node(op, list(inputs), [output], **attributes))
         return output
 
-    def affine(self, x: str, scale: Any, shift: Any, dtype: Any = np.float32) -> str:
+    def affine(self, x: str, scale: ArrayLike, shift: ArrayLike, dtype: DTypeLike = np.float32) -> str:
         """``x * scale + shift``."""
         return self("Add", self("Mul", x, self.constant(scale, dtype)), self.constant(shift, dtype))
 
@@ -63,7 +63,8 @@ def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
 
     State tensors are ``subgoal`` (task units), ``time_budget`` and ``elapsed`` (control steps; ``elapsed`` is -1 before
     the first option), all three float64, and ``membrane``, float32; the next ones are called ``next_<name>``. Start an
-    episode with elapsed -1 and zeros elsewhere. Inside, all arithmetic is double, rounded where the agent rounds.
+    episode with elapsed -1 and zeros elsewhere. All arithmetic is in double precision, rounded at the same places as in
+    the agent.
 
     :param policy: what to export
     """
@@ -98,7 +99,7 @@ def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
 
 
 def _high(g: _Graph, policy: ExportedPolicy) -> tuple[str, str]:
-    """What the high level would choose now: subgoal and time budget."""
+    """The high level's choice: subgoal and time budget."""
     parts = ["desired_goal", "observation"] + ([] if policy.achieved_in_observation else ["achieved_goal"])
     seen = g.cast(g.join(*parts), TensorProto.DOUBLE)
     unit = _squash(g, _mlp(g, policy.high, seen), policy.mean_bounds[0])
@@ -115,7 +116,7 @@ def _high(g: _Graph, policy: ExportedPolicy) -> tuple[str, str]:
 
 
 def _low(g: _Graph, policy: ExportedPolicy, seen: str, over: str, started: str) -> str:
-    """The low level's mean; the circuit's next potentials are named on the way."""
+    """The low level's mean; the circuit's next potentials become an output of the graph."""
     if isinstance(policy.low, MLP):
         return _mlp(g, policy.low, seen)
     zeros = g.constant(np.zeros((1, policy.state_dim)))  # the potentials are kept in single precision

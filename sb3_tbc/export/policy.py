@@ -1,14 +1,16 @@
-"""A trained two-level policy as plain numbers: what every export format is written from."""
+"""A trained two-level policy as plain numbers, from which every export format is written."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch as th
+from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from sb3_tbc.aliases import Plain
@@ -20,14 +22,16 @@ from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.scheduling import ReachRule
 
-ACTIVATIONS = {nn.ReLU: "relu", nn.Tanh: "tanh"}
+ACTIVATIONS: dict[type[nn.Module], str] = {nn.ReLU: "relu", nn.Tanh: "tanh"}
+Reads = Callable[[Mapping[str, FloatArray]], FloatArray]
+"""A task's function of a (batched) observation: its local state or its point in subgoal space."""
 
 
 class Coordinate(NamedTuple):
-    """One coordinate of a state's subgoal-space point, computed from (observation, achieved goal) laid end to end.
+    """One coordinate of a state's subgoal-space point, computed from the concatenated observation and achieved goal.
 
-    ``kind``: ``"clip"``: entry ``first`` clipped to [low, high]; ``"wrap"``: the remainder of entry ``first`` by
-    ``high``, with its sign, as C's fmod; ``"angle"``: atan2 of entries ``first`` and ``second``.
+    ``kind``: ``"clip"``: entry ``first`` clipped to [low, high]; ``"wrap"``: C's fmod of entry ``first`` and ``high``;
+    ``"angle"``: atan2 of entries ``first`` and ``second``.
     """
 
     kind: str
@@ -63,7 +67,7 @@ class Circuit:
     """
 
     sub_steps: int
-    order: tuple[tuple[int, ...], ...]  # in which the closed form takes the neurons, group after group
+    order: tuple[tuple[int, ...], ...]  # groups of neurons in the order of the closed form
     input_gain: FloatArray
     sensory_gain: FloatArray  # (S,)
     sensory_threshold: FloatArray  # (S,)
@@ -85,13 +89,13 @@ class Circuit:
 
     @property
     def lean(self) -> bool:
-        """Whether a synapse is one number: its conductance is the size, its reversal potential the sign."""
+        """Whether a synapse is one number, whose size is the conductance and whose sign is the reversal potential."""
         return len(self.sensory_gain) == 0
 
 
 @dataclass(frozen=True)
 class Dissipative:
-    """A dissipative circuit, ``x <- shrink (x + eta tanh(W u + U x + b))``; U as the certificate leaves it."""
+    """A dissipative circuit, ``x <- shrink (x + eta tanh(W u + U x + b))``; U includes the limit of ``max_rho``."""
 
     sub_steps: int
     eta: float  # length of a sub-step
@@ -110,7 +114,7 @@ class Dissipative:
 
 @dataclass(frozen=True)
 class ExportedPolicy:
-    """Both levels' deterministic actors, and how an option begins and ends."""
+    """Both levels' deterministic actors, and the rules by which an option begins and ends."""
 
     task: str
     n_observation: int
@@ -134,7 +138,7 @@ class ExportedPolicy:
     achieved_in_observation: bool
     relative_subgoals: bool
     remaining_time: bool  # whether the low level sees it
-    fixed_budget: float | None  # steps of every window where the high level does not choose them
+    fixed_budget: float | None  # steps of every window, if the high level does not choose them
     action_low: FloatArray
     action_high: FloatArray
 
@@ -163,7 +167,7 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
 
     :param model: a trained agent
     :param task: name, for file names and comments
-    :raises ConfigError: if something in the model has no exported form, saying what
+    :raises ConfigError: if a part of the model cannot be exported; the message names it
     """
     layout, rules, subgoals = model.views, model.rules, model.views.subgoals
     if isinstance(model.schedule, ReachRule):
@@ -184,7 +188,7 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
         high = _foreign_actor(model.foreign_high)
     if isinstance(high, NDBCActor):
         raise ConfigError("only the low level can be a circuit")
-    actions: Any = model.action_space
+    actions = action_box(model)
     return ExportedPolicy(
         task=task,
         high=_read_mlp(high),
@@ -216,21 +220,39 @@ GOAL_PARTS = {"observation": "observation", "achieved": "achieved_goal", "desire
 
 
 def _width(model: TBCHRL, key: str) -> int:
-    space: Any = model.observation_space
-    return int(space[key].shape[0])
+    space = model.observation_space
+    if not isinstance(space, spaces.Dict):
+        raise TypeError(f"expected an agent with dictionary observations, got {space}")
+    return int(np.prod(space[key].shape or ()))
+
+
+def action_box(model: TBCHRL) -> spaces.Box:
+    """The agent's action space, which is always a Box."""
+    space = model.action_space
+    if not isinstance(space, spaces.Box):
+        raise TypeError(f"expected an agent with a Box action space, got {space}")
+    return space
 
 
 def _actions(actor: MLPActor | NDBCActor) -> int:
     return int(np.prod(actor.action_space.shape))
 
 
-def _bound(actor: Any) -> float:
-    head = getattr(actor, "head", None)  # stock SAC bounds its means by tanh alone
+class _MLPActor(Protocol):
+    """What an MLP actor has, ours or SB3's."""
+
+    activation_fn: type[nn.Module]
+    latent_pi: nn.Module
+    mu: nn.Module
+
+
+def _bound(actor: object) -> float:
+    head = getattr(actor, "head", None)  # SB3's SAC limits its means only by tanh
     return np.inf if head is None or head.mean_bound is None else float(head.mean_bound)
 
 
-def _foreign_actor(algorithm: Any) -> Any:
-    """The actor of another algorithm in the place of the high level, if it is an MLP whose means tanh squashes.
+def _foreign_actor(algorithm: BaseAlgorithm) -> _MLPActor:
+    """The actor of another algorithm that serves as high level, if it is an MLP whose means are squashed by tanh.
 
     :raises ConfigError: if it is of another kind
     """
@@ -245,7 +267,7 @@ def _foreign_actor(algorithm: Any) -> Any:
     )
 
 
-def _read_mlp(actor: Any) -> MLP:
+def _read_mlp(actor: _MLPActor) -> MLP:
     if actor.activation_fn not in ACTIVATIONS:
         allowed = ", ".join(ACTIVATIONS.values())
         raise ConfigError(f"only networks with {allowed} can be exported, this one has {actor.activation_fn.__name__}")
@@ -261,7 +283,9 @@ def read_circuit(net: NDBCNet, n_actions: int) -> Circuit | Dissipative:
     :raises ConfigError: for networks with half-step checks
     """
     if net.step_rule is not None and net.step_rule.half_step_check:
-        raise ConfigError("a circuit with half_step_check cannot be exported: its work varies from step to step")
+        raise ConfigError(
+            "a circuit with half_step_check cannot be exported: its number of sub-steps varies from step to step"
+        )
     cell, wiring = net.cell, net.wiring
     readout = np.zeros((wiring.n_neurons, n_actions), np.float32)
     readout[net.read_from :] = _numpy(net.readout_weight)[:n_actions].T
@@ -303,26 +327,26 @@ def _numpy(tensor: th.Tensor) -> NDArray[np.float32]:
 
 
 class _Probe:
-    """Finds out how a task computes its local state and subgoal-space point, by asking it about many observations.
+    """Finds out how a task computes its local state and subgoal-space point, by calling its functions with many inputs.
 
-    Tasks give these as Python functions. In practice every entry is picked from the observation, some clipped, wrapped
-    or turned into an angle; what is found is checked on further observations, and anything else is refused.
+    Tasks give these as Python functions. In practice every coordinate is an entry of the observation, possibly clipped
+    or wrapped, or the angle of two entries. The result is checked on further observations; other functions are refused.
     """
 
     def __init__(self, n_observation: int, n_achieved: int) -> None:
         self.split, self.n = n_observation, n_observation + n_achieved
         self.rng = np.random.default_rng(0)
 
-    def _ask(self, function: Callable[[Any], FloatArray], entries: FloatArray, desired: float = 0.0) -> FloatArray:
+    def _ask(self, function: Reads, entries: FloatArray, desired: float = 0.0) -> FloatArray:
         observation, achieved = entries[..., : self.split], entries[..., self.split :]
         goal = np.full_like(achieved, desired)
         answer = function({"observation": observation, "achieved_goal": achieved, "desired_goal": goal})
         return np.asarray(answer, dtype=np.float64)
 
-    def selection(self, function: Callable[[Any], FloatArray]) -> tuple[int, ...]:
-        """Which entry each coordinate is.
+    def selection(self, function: Reads) -> tuple[int, ...]:
+        """The index of the entry that each coordinate equals.
 
-        :raises ConfigError: if some coordinate is not simply an entry
+        :raises ConfigError: if a coordinate is not simply an entry
         """
         found = self.coordinates(function)
         for i, c in enumerate(found):
@@ -330,10 +354,10 @@ class _Probe:
                 raise ConfigError(f"entry {i} of the local state is not an entry of the observation: cannot export")
         return tuple(c.first for c in found)
 
-    def coordinates(self, function: Callable[[Any], FloatArray]) -> tuple[Coordinate, ...]:
+    def coordinates(self, function: Reads) -> tuple[Coordinate, ...]:
         """A formula for each coordinate.
 
-        :raises ConfigError: if some coordinate has none of the known forms
+        :raises ConfigError: if a coordinate has none of the known forms
         """
         base = self.rng.normal(size=(8, self.n))
         values = self._ask(function, base)
@@ -369,6 +393,6 @@ class _Probe:
             if np.allclose(candidate(tests), answers, rtol=1e-9, atol=1e-12):
                 return candidate
         raise ConfigError(
-            f"subgoal coordinate {index} depends on entries {entries} of the observation in a way that has no exported "
-            "form (known: an entry, clipped, wrapped to a turn, or the angle of two entries)"
+            f"subgoal coordinate {index} depends on entries {entries} of the observation in a way that cannot be "
+            "exported (possible: an entry, clipped, wrapped to a full turn, or the angle of two entries)"
         )

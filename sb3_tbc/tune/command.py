@@ -35,7 +35,7 @@ ASKED = (
     *("config", "config_file", "search_space", "search", "hyperparams", "n_timesteps", "n_envs", "n_seeds"),
     *("first_seed", "objective", "across_seeds", "threshold", "eval_freq", "n_eval_episodes", "n_final_episodes"),
 )
-"""Options that decide what trials are compared; an existing study has them already, and others are refused."""
+"""Options that determine what is compared. They are stored with a study; other values are refused later."""
 DEFAULTS: Plain = {
     "n_seeds": 2,
     "first_seed": 0,
@@ -67,7 +67,12 @@ def build_parser() -> Parser:
     add("--sampler", default="tpe", help="tpe, random, or another of optuna.samplers")
     add("--sampler-seed", type=int, default=0, help="seed of the sampler")
     add("--pruner", default="median+wilcoxon", help="median, hyperband, halving, wilcoxon, none, or two joined by +")
-    add("--minutes", type=float, default=math.inf, help="begin no trial after this time; by default there is no limit")
+    add(
+        "--minutes",
+        type=float,
+        default=math.inf,
+        help="begin no trial after this many minutes; by default there is no limit",
+    )
     add("--grace-seconds", type=positive_int, default=120, help="a worker that has written nothing for this many "
         "seconds counts as dead, and its trial is started again")  # fmt: skip
     add("--log-folder", type=Path, default=Path("runs/tune"), help="runs go to <folder>/<study>/trial_<n>/seed_<s>")
@@ -79,20 +84,28 @@ def build_parser() -> Parser:
         "what all trials share", "fixed when a study begins; not needed when it is continued"
     )
     add = same.add_argument
-    add("--n-seeds", type=positive_int, help="training runs per trial (default: 2)")
-    add("--first-seed", type=int, help="the runs of a trial have this seed and the next ones (default: 0)")
+    add("--n-seeds", type=positive_int, help="training runs per trial, one per seed (default: 2)")
+    add(
+        "--first-seed",
+        type=int,
+        help="seed of a trial's first run; the next runs have the following seeds (default: 0)",
+    )
     add("--objective", choices=list(OBJECTIVES), help="what makes a trial good (default: auc). "
         + "; ".join(f"{k}: {o.text}" for k, o in OBJECTIVES.items()))  # fmt: skip
-    add("--across-seeds", choices=list(ACROSS), help="how the values of the seeds become the trial's (default: mean)")
+    add(
+        "--across-seeds",
+        choices=list(ACROSS),
+        help="how the values of the seeds are combined into the trial's (default: mean)",
+    )
     add("--threshold", type=float, help="success rate that the objective steps-to-success waits for (default: 0.9)")
     add("--n-timesteps", type=positive_int, help="environment steps per run; by default the task's")
-    add("--n-envs", type=positive_int, help="environments side by side; by default the configuration's")
+    add("--n-envs", type=positive_int, help="parallel environments; by default the configuration's")
     add("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a fortieth of a run")
     add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (default: 20)")
     add("--n-final-episodes", type=positive_int, help="episodes of the evaluation after training (default: 20)")
     add("--config", choices=CONFIGS, help="values of all settings that are not searched; by default tuned, for tasks "
                        "that have them")  # fmt: skip
-    add("--config-file", type=Path, help="take them from this file, with sections like those of zoo_configs")
+    add("--config-file", type=Path, help="take these values from this file, with sections as in zoo_configs")
     add("--hyperparams", nargs="+", metavar="NAME:VALUE", help="settings that keep this value in all trials")
     add("--search", nargs="+", metavar="NAME", help="search only these parameters; * and ? stand for other characters")
     add("--search-space", type=Path, help="a file that changes ranges, see zoo_configs/search")
@@ -103,13 +116,13 @@ def build_parser() -> Parser:
 
 
 def asked(args: argparse.Namespace) -> Plain:
-    """The options given that decide what is compared, as plain data."""
+    """Those of the given options that determine what is compared, as plain data."""
     given = {name: getattr(args, name) for name in ASKED if getattr(args, name) is not None}
     return {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
 
 
 def new_settings(args: argparse.Namespace) -> StudySettings:
-    """What the trials of a new study share.
+    """Settings shared by all trials of a new study.
 
     :raises ConfigError: for unknown names and wrong values, before anything is written
     """
@@ -123,11 +136,12 @@ def new_settings(args: argparse.Namespace) -> StudySettings:
     runs = baselines(args, task, env_id, fixed)
     wanted = args.config or next(reversed(runs))
     base = runs[wanted] if wanted in runs else next(iter(runs.values()))
-    runs = {name: replace(run, n_timesteps=base.n_timesteps) for name, run in runs.items()}  # one budget for all
+    runs = {name: replace(run, n_timesteps=base.n_timesteps) for name, run in runs.items()}  # equal steps for all
     eval_freq = args.eval_freq or min(max(base.n_timesteps // 40, 100), base.n_timesteps)
     if eval_freq > base.n_timesteps:
         raise ConfigError(
-            f"--eval-freq must be at most the {base.n_timesteps} steps of a run, or none is evaluated; got {eval_freq}"
+            f"--eval-freq must be at most the {base.n_timesteps} steps of a run, got {eval_freq}: "
+            "no evaluation would take place"
         )
     resolved = {"n_timesteps": base.n_timesteps, "n_envs": base.n_envs, "eval_freq": eval_freq}
     space = restrict(load_space(args.algo, task, args.search_space), base, args.search or [], fixed)
@@ -146,7 +160,7 @@ def new_settings(args: argparse.Namespace) -> StudySettings:
 
 
 def baselines(args: argparse.Namespace, task: str, env_id: str, fixed: Plain) -> dict[str, RunConfig]:
-    """The configurations of the first trials: the paper's row and the shipped tuned one, or what ``train`` would run.
+    """The configurations of the first trials: the paper's and the shipped tuned one, or that of ``train``.
 
     :raises ConfigError: if one of them cannot be built
     """
@@ -163,9 +177,9 @@ def baselines(args: argparse.Namespace, task: str, env_id: str, fixed: Plain) ->
 
 
 def _checked(run: RunConfig, env_id: str) -> RunConfig:
-    """A configuration with its circuit written out, after building its agent once with small buffers.
+    """Check a configuration by building its agent once with small buffers; return it with all settings of the circuit.
 
-    :raises ConfigError: if the task or the agent refuses
+    :raises ConfigError: if the task or the agent refuses a setting
     """
     env = make_envs(env_id, 1, 0, run.env_kwargs)
     try:
@@ -184,7 +198,7 @@ def _checked(run: RunConfig, env_id: str) -> RunConfig:
 
 
 def open_command_study(args: argparse.Namespace) -> tuple[Study, StudySettings, str, Path]:
-    """Open or begin the study of a command: it, its settings, its storage and its folder.
+    """Open or create the study of a command; return it with its settings, its storage and its folder.
 
     :raises ConfigError: for a user's mistake
     """
@@ -198,7 +212,7 @@ def open_command_study(args: argparse.Namespace) -> tuple[Study, StudySettings, 
     storage = args.storage or str(folder / "journal.log")
     given = {"algo": args.algo, "env": task, **asked(args)}
     fresh = studies.is_url(storage) or not Path(storage).is_file()
-    wanted = new_settings(args) if fresh and args.trial is None else None  # mistakes are told before a file is made
+    wanted = new_settings(args) if fresh and args.trial is None else None  # mistakes are reported before a file is made
     if args.trial is not None and not studies.is_url(storage) and not Path(storage).is_file():
         raise ConfigError(f"no study {name!r}: there is no {storage}; search first, or name its --storage")
     opened = studies.open_storage(storage, args.grace_seconds)
@@ -233,7 +247,7 @@ def command(argv: Sequence[str]) -> int:
 
 
 def search(args: argparse.Namespace, study: Study, settings: StudySettings, storage: str, folder: Path) -> int:
-    """Run the workers and write what was found."""
+    """Run the workers and write the results."""
     from sb3_tbc.tune.study import count_done, shown, try_sampler
     from sb3_tbc.tune.worker import Job, run_workers
 
@@ -257,7 +271,7 @@ def search(args: argparse.Namespace, study: Study, settings: StudySettings, stor
 
 
 def summarise(study: Study, settings: StudySettings, folder: Path) -> None:
-    """Write the table, the plots and the best trial's configuration, and say where they are."""
+    """Write the table, the plots and the best trial's configuration, and print their paths."""
     from sb3_tbc.tune import results as reports
     from sb3_tbc.tune.study import ORIGIN
 

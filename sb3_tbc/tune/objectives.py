@@ -12,7 +12,7 @@ Rows = Sequence[EvaluationRow]
 
 
 class Objective(NamedTuple):
-    """A score and the direction in which it gets better; ``score(rows, n_timesteps, threshold)`` of a curve so far."""
+    """A score and the direction in which it improves; ``score(rows, n_timesteps, threshold)`` rates a curve so far."""
 
     direction: Literal["minimize", "maximize"]
     score: Callable[[Rows, int, float], float]
@@ -41,8 +41,8 @@ def area(rows: Rows, n_timesteps: int, threshold: float) -> float:
 def steps_to_success(rows: Rows, n_timesteps: int, threshold: float) -> float:
     """Environment steps until an evaluation first reaches ``threshold``.
 
-    A run that does not is put behind all that do: ``n_timesteps (2 - best success / threshold)``, so that nearer is
-    still better.
+    A run that does not reach it gets ``n_timesteps (2 - best success / threshold)``: worse than all runs that do, and
+    better the nearer it came.
     """
     for row in rows:
         if row.success_rate >= threshold:
@@ -58,4 +58,4 @@ OBJECTIVES = {
     "steps-to-success": Objective("minimize", steps_to_success, "steps until the success rate reaches --threshold"),
 }
 ACROSS: dict[str, Callable[[Sequence[float]], float]] = {"mean": statistics.fmean, "median": statistics.median}
-"""How a trial's seeds become its value."""
+"""How the values of a trial's seeds are combined."""

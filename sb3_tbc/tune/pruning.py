@@ -1,11 +1,11 @@
-"""When a trial is given up: within a run against other trials' curves, across seeds by a paired test."""
+"""When a trial is pruned: within a run, by comparison with other trials' curves; across seeds, by a paired test."""
 
 from __future__ import annotations
 
 import copy
 import warnings
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import cast
 
 from optuna.pruners import BasePruner, HyperbandPruner, MedianPruner, NopPruner, SuccessiveHalvingPruner, WilcoxonPruner
 from optuna.study import Study, StudyDirection
@@ -17,14 +17,14 @@ WITHIN = ("median", "hyperband", "halving")
 ACROSS = "wilcoxon"
 NONE = "none"
 P_VALUE = 0.1
-"""Of the one-sided Wilcoxon test; it needs at least four seeds to fall below (four of four worse: p = 1/16)."""
+"""Limit of the one-sided Wilcoxon test; a smaller p needs at least four seeds (four of four worse: p = 1/16)."""
 SEED_VALUES = "seed_values"
 """Trial attribute: seed -> its score."""
 
 
 @dataclass
 class _SeedView:
-    """What the Wilcoxon test looks at in a study: the best trial's seeds, not its curve."""
+    """Stands for a study in the Wilcoxon test, which then compares the best trial's seeds instead of its curve."""
 
     best_trial: FrozenTrial
     direction: StudyDirection
@@ -38,13 +38,14 @@ def seed_view(trial: FrozenTrial) -> FrozenTrial:
 
 
 class SeedPruner(BasePruner):
-    """Optuna has one pruner per study and one list of reports per trial; a trial of several seeds needs two views.
+    """Two pruners for trials of several seeds: one sees each evaluation, the other each finished seed.
 
-    Reports are numbered on through a trial's seeds, each the mean of the finished seeds and the running one, so that
-    trials are compared at the same evaluation of the same seed. The paired test compares finished seeds.
+    Optuna allows one pruner per study and one list of reports per trial. Reports are numbered consecutively over a
+    trial's seeds. Each is the mean over the finished seeds and the running one, so that trials are compared at the same
+    evaluation of the same seed.
 
-    :param within: consulted after each evaluation
-    :param across: consulted about finished seeds
+    :param within: asked after each evaluation
+    :param across: asked with the scores of the finished seeds
     """
 
     def __init__(self, within: BasePruner, across: WilcoxonPruner | None) -> None:
@@ -53,7 +54,7 @@ class SeedPruner(BasePruner):
         self.reason = ""
 
     def prune(self, study: Study, trial: FrozenTrial) -> bool:
-        """Whether to give a trial up; ``reason`` says why."""
+        """Whether to prune a trial; ``reason`` says why."""
         if self.across is not None and self._worse_across(study, trial):
             self.reason = "worse than the best trial on the same seeds (Wilcoxon)"
             return True
@@ -73,7 +74,7 @@ class SeedPruner(BasePruner):
             return False
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # seeds that only one of the two has are left out, as they should be
-            return self.across.prune(cast(Any, _SeedView(best, study.direction)), view)
+            return self.across.prune(cast(Study, _SeedView(best, study.direction)), view)
 
 
 def make_pruner(name: str, n_evaluations: int, n_seeds: int) -> SeedPruner:

@@ -1,4 +1,4 @@
-"""What a search found: the best trial as a configuration file, a table of trials, plots."""
+"""Results of a search: the best trial as a configuration file, a table of trials, plots."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import math
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import optuna
 import yaml
@@ -22,11 +22,14 @@ from sb3_tbc.tune.pruning import SEED_VALUES
 from sb3_tbc.tune.study import ORIGIN, REASON, WORKER, StudySettings
 from sb3_tbc.zoo.config import RunConfig, merge
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 
 def find_trial(study: Study, which: str) -> FrozenTrial:
-    """The trial of a number, 0 included, or the best.
+    """The trial with a number (from 0), or the best one.
 
-    :raises ConfigError: if there is none
+    :raises ConfigError: if there is no such trial
     """
     if which == "best":
         try:
@@ -44,7 +47,7 @@ def find_trial(study: Study, which: str) -> FrozenTrial:
 
 
 def difference(base: PlainMapping, other: PlainMapping) -> Plain:
-    """What must be laid over ``base`` to get ``other``, which has at least the same keys."""
+    """The changes that turn ``base`` into ``other``, which has at least the same keys."""
     found: Plain = {}
     for key, value in other.items():
         old = base.get(key)
@@ -67,7 +70,7 @@ def trial_file(settings: StudySettings, trial: FrozenTrial, study_name: str) -> 
     run = settings.config_of(trial)
     paper = as_section(RunConfig.from_dict(next(iter(settings.baselines.values()))))
     tuned = difference(paper, as_section(run))
-    if merge(paper, tuned) != as_section(run):  # a key that the base has and the trial lacks
+    if merge(paper, tuned) != as_section(run):  # a key of the base is missing in the trial
         paper, tuned = as_section(run), {}
     section = {**paper, **({"tuned": tuned} if tuned else {})}
     seeds = ", ".join(f"{seed}: {float(value):.4g}" for seed, value in trial.user_attrs.get(SEED_VALUES, {}).items())
@@ -110,13 +113,13 @@ def complete_trials(study: Study) -> list[FrozenTrial]:
 
 
 def importances(study: Study) -> dict[str, float]:
-    """Share of each parameter in the difference between good and bad trials (PED-ANOVA); empty if few or equal."""
+    """Share of each parameter in the difference between good and bad trials (PED-ANOVA); empty with too few trials."""
     values = {trial.value for trial in complete_trials(study)}
     if len(complete_trials(study)) < 4 or len(values) == 1:
         return {}
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # few trials make it inaccurate: the docs say so once
+            warnings.simplefilter("ignore")  # it warns that few trials make it inaccurate
             evaluator = optuna.importance.PedAnovaImportanceEvaluator()
             found = optuna.importance.get_param_importances(study, evaluator=evaluator)
     except (ValueError, RuntimeError):
@@ -155,7 +158,7 @@ def plot_importances(study: Study, path: Path) -> None:
     _save(figure, path)
 
 
-def _save(figure: Any, path: Path) -> None:
+def _save(figure: Figure, path: Path) -> None:
     save_atomic(lambda name: figure.savefig(name, dpi=120), path)
 
 

@@ -1,6 +1,7 @@
-"""What a search varies: ranges read from YAML, turned into a trial's suggestions and those into a configuration.
+"""Search spaces: ranges are read from YAML, a trial chooses values, and the values become a configuration.
 
-Nothing here imports Optuna: a space is data, and a trial is whatever has ``suggest_float`` and its sisters.
+Nothing here imports Optuna: a space is data, and a trial is any object with ``suggest_float``, ``suggest_int`` and
+``suggest_categorical``.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
@@ -19,11 +20,14 @@ from sb3_tbc.tbc_hrl.config import CircuitConfig
 from sb3_tbc.zoo.config import RunConfig, merge
 from sb3_tbc.zoo.schema import CONFIG_CLASSES, RUN, coerce, validate
 
+Label = str | int | float | bool | None
+"""A value of a parameter: a number of its range, or one of its choices (the types that Optuna allows)."""
+
 Values = Plain
 """Parameter name -> value, as a trial holds it."""
 
 SCHEDULE = "learning_rate_schedule"
-"""The one parameter that sets nothing itself: with ``linear`` the searched learning rates fall to zero."""
+"""Parameter without a setting of its own: with ``linear`` the searched learning rates fall to zero."""
 SCHEDULES = ("constant", "linear")
 FIELDS = ("low", "high", "log", "step", "choices", "keys", "when")
 CIRCUIT = "low.policy_kwargs.ndbc"
@@ -38,7 +42,7 @@ class Suggests(Protocol):
     def suggest_int(self, name: str, low: int, high: int, *, step: int, log: bool) -> int:
         """Return a whole number."""
 
-    def suggest_categorical(self, name: str, choices: Sequence[Any]) -> Any:
+    def suggest_categorical(self, name: str, choices: Sequence[Label]) -> Label:
         """Return one of the choices."""
 
 
@@ -46,14 +50,14 @@ class Suggests(Protocol):
 class Parameter:
     """One searched quantity.
 
-    :param name: as the study shows it
+    :param name: name in the study
     :param keys: dotted keys of the configuration that get the value
     :param low: lower end of a range, inclusive; whole if both ends are
     :param high: upper end
     :param log: sample the logarithm uniformly
     :param step: spacing, None for none
     :param choices: labels instead of a range
-    :param sets: label -> dotted keys and their values, where a label stands for something else than itself
+    :param sets: label -> dotted keys and their values, if a label stands for several settings or for another value
     :param when: only if another parameter has this value
     """
 
@@ -63,16 +67,16 @@ class Parameter:
     high: float = 0.0
     log: bool = False
     step: float | None = None
-    choices: tuple[Any, ...] = ()
-    sets: Mapping[Any, PlainMapping] = field(default_factory=dict)
-    when: tuple[str, Any] | None = None
+    choices: tuple[Label, ...] = ()
+    sets: Mapping[Label, PlainMapping] = field(default_factory=dict)
+    when: tuple[str, object] | None = None
 
     @property
     def whole(self) -> bool:
         """Whether the range is one of whole numbers."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
-    def suggest(self, trial: Suggests) -> Any:
+    def suggest(self, trial: Suggests) -> Label:
         """Let a trial choose."""
         if self.choices:
             return trial.suggest_categorical(self.name, self.choices)
@@ -80,11 +84,11 @@ class Parameter:
             return trial.suggest_int(self.name, int(self.low), int(self.high), step=int(self.step or 1), log=self.log)
         return trial.suggest_float(self.name, self.low, self.high, step=self.step, log=self.log)
 
-    def settings(self, value: Any) -> Values:
+    def settings(self, value: Label) -> Values:
         """Dotted configuration keys for a value."""
         return dict(self.sets[value]) if self.sets else dict.fromkeys(self.keys, value)
 
-    def holds(self, value: Any) -> bool:
+    def holds(self, value: object) -> bool:
         """Whether a value lies in the range or among the choices."""
         if self.choices:
             return value in self.choices
@@ -92,8 +96,8 @@ class Parameter:
             return False
         return not self.whole or (float(value).is_integer() and (value - self.low) % int(self.step or 1) == 0)
 
-    def read(self, run: RunConfig) -> Any:
-        """The value that would give a configuration its settings, None if there is none."""
+    def read(self, run: RunConfig) -> object:
+        """The value that corresponds to a configuration's settings, None if there is none."""
         if self.name == SCHEDULE:
             rates = [read_key(run, f"{level}.learning_rate") for level in ("low", "high")]
             return SCHEDULES[any(isinstance(rate, str) and rate.startswith("lin_") for rate in rates)]
@@ -108,20 +112,20 @@ class Parameter:
 Space = tuple[Parameter, ...]
 
 
-def _same(value: Any, wanted: Any) -> bool:
-    """Equality, where ``auto_0.4`` (automatic from a start value) counts as ``auto``."""
+def _same(value: object, wanted: object) -> bool:
+    """Whether two values are equal; ``auto_0.4`` (automatic from a start value) counts as ``auto``."""
     return bool(value == wanted) or (wanted == "auto" and str(value).startswith("auto"))
 
 
-def _plain(value: Any) -> Any:
-    """A learning rate's start value; whatever else it is, itself."""
+def _plain(value: object) -> object:
+    """The start value of a learning rate ``lin_...``; any other value unchanged."""
     return float(value.removeprefix("lin_")) if isinstance(value, str) and value.startswith("lin_") else value
 
 
-def read_key(run: RunConfig, key: str) -> Any:
-    """A configuration's value of a dotted key, or what the agent takes where the configuration says nothing."""
+def read_key(run: RunConfig, key: str) -> object:
+    """A configuration's value of a dotted key, or the agent's default if the configuration does not set it."""
     first, *rest = key.split(".")
-    value: Any = run.env_kwargs if first == "env_kwargs" else getattr(run, first) if first in RUN else None
+    value: object = run.env_kwargs if first == "env_kwargs" else getattr(run, first) if first in RUN else None
     value = run.model.get(first) if first not in RUN else value
     for name in rest:
         value = value.get(name) if isinstance(value, Mapping) else None
@@ -130,11 +134,11 @@ def read_key(run: RunConfig, key: str) -> Any:
     return _default(run.algo, key) if value is None and not _is_set(run.model, key) else value
 
 
-def _default(algo: str, key: str) -> Any:
-    """An algorithm's default of a dotted key; None where it has no such setting."""
+def _default(algo: str, key: str) -> object:
+    """An algorithm's default of a dotted key; None if it has no such setting."""
     if algo not in CONFIG_CLASSES:
         return None
-    value: Any = CONFIG_CLASSES[algo]().to_dict()
+    value: object = CONFIG_CLASSES[algo]().to_dict()
     for name in key.split("."):
         value = value.get(name) if isinstance(value, Mapping) else None
     return value
@@ -168,7 +172,7 @@ def space_file(algo: str) -> Path:
 def read_sections(path: Path) -> dict[str, Plain]:
     """Read a search-space file.
 
-    :raises ConfigError: if it cannot be read or is not sections of parameters
+    :raises ConfigError: if it cannot be read or does not consist of sections of parameters
     """
     data = read_yaml(path)
     if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
@@ -178,7 +182,7 @@ def read_sections(path: Path) -> dict[str, Plain]:
 
 
 def load_space(algo: str, task: str, extra: Path | None = None) -> dict[str, Plain]:
-    """The declaration of a search: shipped default -> shipped task -> the user's default -> the user's task.
+    """The declared space of a search, merged from the shipped file and the user's, default section before task section.
 
     :param extra: the user's file; a parameter set to ``null`` is not searched
     :return: parameter name -> its fields, plain data that a study can keep
@@ -195,8 +199,8 @@ def load_space(algo: str, task: str, extra: Path | None = None) -> dict[str, Pla
     return space
 
 
-def _over(old: Any, new: Any) -> Any:
-    """Lay a parameter's fields over earlier ones; a range replaces choices and the other way round."""
+def _over(old: object, new: object) -> object:
+    """Update a parameter's fields; a range replaces choices, and choices replace a range."""
     if not isinstance(old, Mapping) or not isinstance(new, Mapping):
         return new
     dropped = ("low", "high", "log", "step") if "choices" in new else ("choices",) if "low" in new else ()
@@ -217,7 +221,7 @@ def build_space(declared: Mapping[str, PlainMapping]) -> Space:
     return tuple(space)
 
 
-def _parameter(name: str, fields: Any) -> Parameter:
+def _parameter(name: str, fields: object) -> Parameter:
     where = f"search parameter {name}"
     if not isinstance(fields, Mapping):
         raise ConfigError(f"{where} must have fields like low and high, got {fields!r}")
@@ -227,7 +231,7 @@ def _parameter(name: str, fields: Any) -> Parameter:
     keys = tuple(fields.get("keys") or ((name,) if name != SCHEDULE else ()))
     when = fields.get("when")
     if when is not None and not (isinstance(when, Mapping) and len(when) == 1):
-        raise ConfigError(f"{where}: 'when' is one parameter and its value, got {when!r}")
+        raise ConfigError(f"{where}: 'when' takes one parameter and its value, got {when!r}")
     condition = next(iter(when.items())) if when else None
     choices = fields.get("choices")
     if choices is not None:
@@ -244,11 +248,15 @@ def _parameter(name: str, fields: Any) -> Parameter:
     return parameter
 
 
-def _choice(name: str, keys: tuple[str, ...], choices: Any, when: tuple[str, Any] | None, where: str) -> Parameter:
+def _choice(
+    name: str, keys: tuple[str, ...], choices: object, when: tuple[str, object] | None, where: str
+) -> Parameter:
     sets = choices if isinstance(choices, Mapping) else {}
     labels = tuple(choices) if isinstance(choices, Mapping | list) else ()
     if not labels or not all(isinstance(label, str | int | float | bool) for label in labels):
-        raise ConfigError(f"{where}: choices are a list of values, or labels and what they set, got {choices!r}")
+        raise ConfigError(
+            f"{where}: choices must be a list of values, or labels with the settings they stand for, got {choices!r}"
+        )
     if name == SCHEDULE and not set(labels) <= set(SCHEDULES):
         raise ConfigError(f"{where} must be among {', '.join(SCHEDULES)}, got {list(labels)}")
     parameter = Parameter(name, keys, choices=labels, sets={k: dict(v or {}) for k, v in sets.items()}, when=when)
@@ -257,7 +265,7 @@ def _choice(name: str, keys: tuple[str, ...], choices: Any, when: tuple[str, Any
     return parameter
 
 
-def _check_keys(parameter: Parameter, value: Any, where: str) -> None:
+def _check_keys(parameter: Parameter, value: Label, where: str) -> None:
     if parameter.name != SCHEDULE:
         validate(nested(parameter.settings(value)), None, where)
 
@@ -265,12 +273,12 @@ def _check_keys(parameter: Parameter, value: Any, where: str) -> None:
 def restrict(
     declared: Mapping[str, PlainMapping], run: RunConfig, patterns: Iterable[str], fixed: PlainMapping
 ) -> dict[str, Plain]:
-    """Leave out what is not to be searched or can have no effect.
+    """Leave out parameters that are not searched or have no effect.
 
     :param declared: the whole space
-    :param run: configuration that all other settings come from
+    :param run: configuration that gives all other settings
     :param patterns: names to search, with ``*`` and ``?``; none for all
-    :param fixed: settings of the command line (nested): what they set is not searched
+    :param fixed: settings of the command line (nested), which are not searched
     :raises ConfigError: if a pattern matches nothing, or nothing is left
     """
     wanted = list(patterns)
@@ -299,7 +307,7 @@ def restrict(
 
 
 def _idle_keys(run: RunConfig) -> tuple[str, ...]:
-    """Beginnings of keys that change nothing: a circuit where there is none, the rule's scale where nobody asks it."""
+    """Prefixes of keys without effect: a circuit's if there is none, ``kappa`` if the rule is not used."""
     idle = [] if read_key(run, CIRCUIT) is not None else [CIRCUIT]
     if read_key(run, "duration") != "rule" and not read_key(run, "duration_loss_coef"):
         idle.append("kappa")
@@ -307,7 +315,7 @@ def _idle_keys(run: RunConfig) -> tuple[str, ...]:
 
 
 def _is_set(settings: PlainMapping, key: str) -> bool:
-    value: Any = settings
+    value: object = settings
     for name in key.split("."):
         if not isinstance(value, Mapping) or name not in value:
             return False
@@ -334,7 +342,7 @@ def suggest(space: Space, trial: Suggests, only: Iterable[str] | None = None) ->
 
 
 def project(space: Space, run: RunConfig) -> Values:
-    """A configuration as values of the space; values outside of their range are left out."""
+    """Express a configuration by values of the space; values outside their range are left out."""
     values: Values = {}
     for parameter in space:
         if parameter.when and values.get(parameter.when[0]) != parameter.when[1]:
@@ -346,7 +354,7 @@ def project(space: Space, run: RunConfig) -> Values:
 
 
 def apply(space: Space, values: PlainMapping, run: RunConfig) -> RunConfig:
-    """A configuration with a trial's values laid over it.
+    """A configuration updated with a trial's values.
 
     :raises ConfigError: if a value is of the wrong kind
     """
@@ -366,9 +374,10 @@ def apply(space: Space, values: PlainMapping, run: RunConfig) -> RunConfig:
 
 
 def complete(run: RunConfig, action_dim: int) -> RunConfig:
-    """A configuration in which the circuit is written out where the agent would take its default one.
+    """A configuration with all settings of the circuit, also those that the agent would take from its defaults.
 
-    A task without a section has none; a trial that changed one size only would leave the others out.
+    The configuration of a task without a section has no circuit. A trial that set a single size would otherwise leave
+    out the others.
 
     :param action_dim: size of the task's actions, which is the default number of motor neurons
     """

@@ -1,4 +1,4 @@
-"""Where a search lives: storages with a heartbeat, studies that know what they compare, samplers by name."""
+"""Studies of a search: storages with a heartbeat, the settings that all trials share, samplers by name."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ from sb3_tbc.zoo.config import RunConfig
 SETTINGS = "settings"
 """Study attribute with :class:`StudySettings`."""
 ORIGIN = "origin"
-"""Trial attribute of the first trials: which configuration it is, ``paper``, ``tuned`` or ``default``."""
+"""Trial attribute of the first trials: name of their configuration, ``paper``, ``tuned`` or ``default``."""
 REASON = "reason"
-"""Trial attribute: why a trial was given up."""
+"""Trial attribute: why a trial was pruned."""
 WORKER = "worker"
-"""Trial attribute: who runs it."""
+"""Trial attribute: the worker that runs it."""
 COUNTED = (TrialState.COMPLETE, TrialState.PRUNED)
 """States of trials that are done; a failed trial is not, because it is run again."""
 MAX_RETRIES = 3
@@ -49,7 +49,7 @@ optuna.logging.set_verbosity(optuna.logging.ERROR)
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Optuna calls "experimental" what has been there for years."""
+    """Suppress Optuna's warnings about features that it still calls experimental."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         yield
@@ -57,13 +57,13 @@ def _quiet() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class StudySettings:
-    """What all trials of a study share. It is stored with the study, so a resumed search compares like with like.
+    """Settings that all trials of a study share, stored with the study, so that a resumed search compares equal trials.
 
     :param algo: algorithm
     :param env: environment as the user named it (``module:id`` imports the module first)
     :param task: its short name
     :param env_id: its id
-    :param base: configuration (as plain data) that everything not searched comes from
+    :param base: configuration (as plain data) of everything that is not searched
     :param baselines: name -> configuration of the first trials
     :param space: declaration of the search space
     :param n_seeds: training runs per trial
@@ -72,9 +72,9 @@ class StudySettings:
     :param across_seeds: ``mean`` or ``median``
     :param threshold: success rate that ``steps-to-success`` waits for
     :param eval_freq: environment steps between evaluations
-    :param n_eval_episodes: episodes of each
+    :param n_eval_episodes: episodes per evaluation
     :param n_final_episodes: episodes of the evaluation after training
-    :param asked: the command-line options that led to this, by which a resuming command is checked
+    :param asked: command-line options of the study, against which those of a resuming command are checked
     """
 
     algo: str
@@ -96,7 +96,7 @@ class StudySettings:
 
     @property
     def run(self) -> RunConfig:
-        """The configuration that trials depart from."""
+        """The configuration on which trials are based."""
         return RunConfig.from_dict(self.base)
 
     @property
@@ -111,12 +111,12 @@ class StudySettings:
 
     @property
     def n_evaluations(self) -> int:
-        """Evaluations of one training run, and one to spare: several environments overshoot by a step or two."""
+        """Upper limit of the evaluations in a training run; parallel environments may overshoot by a step or two."""
         return self.run.n_timesteps // self.eval_freq + 1
 
     @property
     def direction(self) -> Literal["minimize", "maximize"]:
-        """Whether the objective is to grow or to fall."""
+        """Whether the objective is maximised or minimised."""
         return OBJECTIVES[self.objective].direction
 
     def first_trials(self) -> dict[str, Values]:
@@ -124,7 +124,7 @@ class StudySettings:
         return {name: project(self.parameters, RunConfig.from_dict(run)) for name, run in self.baselines.items()}
 
     def config_of(self, trial: FrozenTrial) -> RunConfig:
-        """The configuration of a trial; a baseline's is its own, not only what the space can say of it."""
+        """The configuration of a trial; that of a baseline is returned as it is, with values outside the space, too."""
         return self.config_of_values(trial.user_attrs.get(ORIGIN), trial.params)
 
     def config_of_values(self, origin: str | None, values: Values) -> RunConfig:
@@ -135,14 +135,13 @@ class StudySettings:
 
 
 class JournalWithHeartbeat(JournalStorage, BaseHeartbeat):
-    """A journal file whose running trials show signs of life, as Optuna's databases do; its own journal has none.
+    """A journal file with a heartbeat of running trials; Optuna has one for databases, but not for journals.
 
-    A sign of life is the time of a small file beside the journal, so it costs no line in it. Ages are taken from the
-    file system's clock.
+    The heartbeat is the modification time of a small file beside the journal, measured by the file system's clock.
 
     :param path: the journal
-    :param interval: seconds between signs of life
-    :param grace: seconds after which a trial without one is given to another worker
+    :param interval: seconds between heartbeats
+    :param grace: seconds without a heartbeat after which a trial is given to another worker
     :param callback: called with such a trial
     """
 
@@ -153,7 +152,7 @@ class JournalWithHeartbeat(JournalStorage, BaseHeartbeat):
         self._interval, self._grace, self._callback = interval, grace, callback
 
     def record_heartbeat(self, trial_id: int) -> None:
-        """Say that a trial's worker lives."""
+        """Record that a trial's worker is alive."""
         (self._folder / f"trial_{trial_id}").touch()
 
     def _get_stale_trial_ids(self, study_id: int) -> list[int]:
@@ -172,11 +171,11 @@ class JournalWithHeartbeat(JournalStorage, BaseHeartbeat):
             return (trial.datetime_start or datetime.datetime.now()).timestamp()
 
     def get_heartbeat_interval(self) -> int:
-        """Seconds between signs of life."""
+        """Seconds between heartbeats."""
         return self._interval
 
     def get_heartbeat_stale_trial_callback(self) -> Retry:
-        """Return what retries a dead worker's trial."""
+        """The function that queues a dead worker's trial again."""
         return self._callback
 
 
@@ -189,15 +188,15 @@ def open_storage(storage: str, grace: int = 120) -> BaseStorage:
     """Open a journal file (created with its folder) or a database, with a heartbeat either way.
 
     :param storage: path ending in ``.log`` or ``.journal``, or a URL like ``postgresql+psycopg://user@host/name``
-    :param grace: seconds without a sign of life after which a trial is given to another worker
-    :raises ConfigError: if it cannot be opened, without the password
+    :param grace: seconds without a heartbeat after which a trial is given to another worker
+    :raises ConfigError: if it cannot be opened; the message does not contain the password
     """
     try:
         with _quiet():
             return _open(storage, grace)
     except ConfigError:
         raise
-    except Exception as error:  # drivers raise what they like; anything here is a storage that cannot be opened
+    except Exception as error:  # database drivers raise errors of any type
         raise ConfigError(f"cannot open storage {shown(storage)}: {_first_line(error, storage)}") from error
 
 
@@ -225,7 +224,7 @@ def _open(storage: str, grace: int) -> BaseStorage:
 
 
 def _first_line(error: Exception, storage: str) -> str:
-    """A driver's message in short; it may quote the whole URL, or the password alone."""
+    """First line of a driver's message, with the password hidden wherever it occurs."""
     text = str(error).replace(storage, shown(storage)).strip() or type(error).__name__
     before, hidden, after = shown(storage).partition(HIDDEN)
     secret = storage[len(before) : len(storage) - len(after)] if hidden else ""
@@ -234,9 +233,9 @@ def _first_line(error: Exception, storage: str) -> str:
 
 
 def drop_half_line(path: Path) -> None:
-    """Cut off a last line of a journal that a killed process, or a full disk, left without its end.
+    """Remove an incomplete last line that a killed process or a full disk left in a journal.
 
-    Optuna passes over such a line, but the next one would be written behind it, and together they cannot be read.
+    Optuna skips such a line, but would append the next one to it, and the two together could not be read.
     """
     if not path.is_file():
         return
@@ -252,31 +251,31 @@ def drop_half_line(path: Path) -> None:
 
 
 LONGEST_LINE = 2**24
-"""Longest line of a journal that is looked for, bytes; Optuna writes some 100,000 for the settings of a study."""
+"""Longest possible line of a journal, bytes; the settings of a study take about 100,000."""
 
 
 @contextlib.contextmanager
 def readable(storage: str) -> Iterator[None]:
-    """Say in one line what is wrong with a storage that cannot be read within.
+    """Turn errors of reading a storage in this context into a message of one line.
 
     :param storage: its name
-    :raises ConfigError: then, without the password
+    :raises ConfigError: if it cannot be read; the message does not contain the password
     """
     try:
         yield
     except (ConfigError, OSError):
         raise
-    except Exception as error:  # a damaged page or line raises whatever the reader happens to meet
+    except Exception as error:  # damaged data raise errors of any type
         text = _first_line(error, storage)
         raise ConfigError(f"cannot read storage {shown(storage)}, it may be damaged: {text}") from error
 
 
 def claim_folder(folder: Path, storage: str, fresh: bool) -> None:
-    """Keep the runs of two studies of one name apart: a folder belongs to the storage that it was begun with.
+    """Reserve a folder for the runs of one study, so that studies of the same name in other storages cannot use it.
 
-    :param folder: of the study's runs
+    :param folder: folder of the study's runs
     :param storage: name of the storage
-    :param fresh: whether the study has just begun
+    :param fresh: whether the study is new
     :raises ConfigError: if the folder holds the runs of another study
     """
     marker, own = folder / "storage.txt", shown(storage) if is_url(storage) else str(Path(storage).resolve())
@@ -304,7 +303,7 @@ def open_study(
     :param where: the storage's name, for messages
     :param wanted: settings of a new study; None to load only
     :param asked: the options given now; those of an existing study must agree
-    :raises ConfigError: if there is none to load, or it is of something else
+    :raises ConfigError: if there is none to load, or it was begun with other options
     """
     known = names(storage)
     if name not in known:
@@ -323,7 +322,7 @@ def open_study(
 
 
 def _wait_for_settings(study: Study) -> None:
-    """A study without trials and settings is being created by another machine this very moment."""
+    """Wait while another machine creates the study, which then has neither trials nor settings yet."""
     for _ in range(200):
         if SETTINGS in study.user_attrs or study.get_trials(deepcopy=False):
             return
@@ -331,7 +330,7 @@ def _wait_for_settings(study: Study) -> None:
 
 
 def read_settings(study: Study) -> StudySettings:
-    """What a study's trials share.
+    """The settings that a study's trials share.
 
     :raises ConfigError: if this command did not make the study
     """
@@ -366,7 +365,7 @@ def queue_first_trials(study: Study, settings: StudySettings) -> None:
 
 
 def count_done(study: Study) -> int:
-    """Trials that are complete or pruned; a failed trial and its retry are one."""
+    """Number of trials that are complete or pruned; a failed trial and its retry count once."""
     return len(study.get_trials(deepcopy=False, states=COUNTED))
 
 
@@ -388,9 +387,9 @@ def requeue(study: Study, trial: FrozenTrial) -> None:
 def make_sampler(name: str, seed: int | None, stream: tuple[int, ...] = ()) -> optuna.samplers.BaseSampler:
     """A sampler by name: ``tpe``, ``random``, or any class of ``optuna.samplers``.
 
-    TPE is multivariate, keeps conditional parameters apart, and does not crowd around trials that still run.
+    TPE is multivariate, treats conditional parameters separately, and avoids the values of trials that still run.
 
-    :param seed: with ``stream`` (worker, trials so far) it gives every worker and every resumption its own numbers
+    :param seed: seed; with ``stream`` (worker, trials so far) every worker and every resumption draws other numbers
     :raises ConfigError: for an unknown name or one that needs arguments or a package
     """
     known = {n.removesuffix("Sampler").lower(): n for n in optuna.samplers.__all__ if n.endswith("Sampler")}
@@ -412,7 +411,7 @@ def make_sampler(name: str, seed: int | None, stream: tuple[int, ...] = ()) -> o
 
 
 def try_sampler(name: str, settings: StudySettings) -> None:
-    """Draw a few trials, so that a sampler that cannot search this space is told of before the first run.
+    """Draw a few trials, so that an unsuitable sampler is reported before the first run.
 
     :raises ConfigError: if it fails
     """
@@ -430,4 +429,4 @@ def try_sampler(name: str, settings: StudySettings) -> None:
 
 
 TRIED = 12
-"""Trials to try a sampler on: most draw their first ten at random."""
+"""Number of trials drawn to test a sampler; most samplers draw the first ten at random."""

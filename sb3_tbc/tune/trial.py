@@ -1,4 +1,4 @@
-"""One trial of a search: the same settings trained on several seeds, watched, given up when there is reason to."""
+"""One trial of a search: the same settings are trained on several seeds, unless the trial is pruned."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DIVERGED = 1e6
 
 
 class Surplus(Exception):
-    """Two workers began the last trial, or queued the same baseline, at the same time; the later one lets go."""
+    """Two workers began the last trial, or queued the same baseline, at the same time; the later one drops it."""
 
 
 class Stopped(Exception):
@@ -39,7 +39,7 @@ class Stopped(Exception):
 
 
 class ReportCallback(BaseCallback):
-    """After each evaluation: give up a diverging run, report the score so far, ask whether to go on.
+    """After each evaluation: stop a diverging run, report the score so far, ask the pruner.
 
     :param report: called with the curve so far; raises ``TrialPruned`` to stop
     """
@@ -54,7 +54,7 @@ class ReportCallback(BaseCallback):
 
     def _on_step(self) -> bool:
         if not isinstance(self.parent, SuccessEvalCallback):
-            raise TypeError(f"ReportCallback belongs into a SuccessEvalCallback, got {type(self.parent).__name__}")
+            raise TypeError(f"ReportCallback works only inside a SuccessEvalCallback, got {type(self.parent).__name__}")
         if self.watch.reason:
             raise optuna.TrialPruned(self.watch.reason)
         self.report(self.parent.rows)
@@ -65,7 +65,7 @@ class ReportCallback(BaseCallback):
 class TrialRunner:
     """The objective: callable with a trial, returns its value.
 
-    :param settings: what all trials share
+    :param settings: settings that all trials share
     :param folder: each trial's runs go to ``<folder>/trial_<number>/seed_<seed>/``
     :param n_trials: size of the search; a trial beyond it is dropped
     :param options: how runs are carried out
@@ -81,7 +81,7 @@ class TrialRunner:
     def __call__(self, trial: Trial) -> float:
         """Train all seeds.
 
-        :raises optuna.TrialPruned: with the reason, which is stored too
+        :raises optuna.TrialPruned: with the reason, which is also stored with the trial
         :raises Stopped: after Ctrl-C or a termination signal
         :raises Surplus: if there are enough trials without this one
         """
@@ -163,7 +163,7 @@ class TrialRunner:
             trial.report(value, index * self.settings.n_evaluations + k + 1)
 
     def _ask(self, trial: Trial, when: str) -> None:
-        """Give the trial up if the pruner says so; the trials everything is compared with are never given up."""
+        """Prune the trial if the pruner says so; the baselines are never pruned."""
         if trial.user_attrs.get(ORIGIN) or not trial.should_prune():
             return
         pruner = trial.study.pruner

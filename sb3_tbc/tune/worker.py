@@ -1,4 +1,4 @@
-"""Workers of a search: processes that take trials from one storage until there are enough."""
+"""Workers of a search: processes that take trials from one storage until enough are done."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ class Job:
 
     :param storage: journal file or URL
     :param study: name
-    :param folder: of the study's runs
-    :param n_trials: trials of the whole study that are to be done (complete or pruned)
-    :param sampler: name
-    :param pruner: name
-    :param seed: of the sampler
+    :param folder: folder of the study's runs
+    :param n_trials: trials of the whole study (complete or pruned)
+    :param sampler: name of the sampler
+    :param pruner: name of the pruner
+    :param seed: seed of the sampler
     :param device: torch device
-    :param grace: seconds after which a silent worker's trial is given to another
-    :param until: ``time.time()`` after which no trial begins
+    :param grace: seconds without a heartbeat after which a worker's trial is given to another
+    :param until: value of ``time.time()`` after which no trial begins
     """
 
     storage: str
@@ -90,9 +90,9 @@ def load(job: Job, index: int) -> tuple[Study, TrialRunner]:
 def work(job: Job, index: int) -> None:
     """Run trials until the study has enough of them.
 
-    A worker stays while the last ones run elsewhere: if that worker dies, its trial is still to be done.
+    A worker waits while other workers run the last trials: if one of them dies, its trial must be run again.
 
-    :raises KeyboardInterrupt: when stopped; the trial is back in the queue then
+    :raises KeyboardInterrupt: when stopped, after the trial was put back into the queue
     """
     study, runner = load(job, index)
     parent = os.getppid()
@@ -126,7 +126,10 @@ def _one_trial(study: Study, runner: TrialRunner, index: int) -> None:
     except (optuna.exceptions.UpdateFinishedTrialError, ValueError) as error:
         if not _was_taken(error):
             raise
-        _say(index, f"trial {started[-1]} was given to another worker after a long silence; dropped here")
+        _say(
+            index,
+            f"trial {started[-1]} is dropped here: another worker has it, because this one was silent too long",
+        )
         return
     except (Stopped, KeyboardInterrupt) as stopped:
         if started:
@@ -136,12 +139,12 @@ def _one_trial(study: Study, runner: TrialRunner, index: int) -> None:
 
 
 def _was_taken(error: Exception) -> bool:
-    """Whether a trial had been declared dead, and so was finished, while it still ran here."""
+    """Whether a trial that still ran here had been marked as failed, because its worker counted as dead."""
     return isinstance(error, optuna.exceptions.UpdateFinishedTrialError) or str(error).startswith("Cannot tell")
 
 
 def _put_back(study: Study, number: int) -> None:
-    """Queue the trial that the user stopped, whatever state the stop left it in."""
+    """Queue the trial that the user stopped again, whatever its state."""
     trial = study.trials[number]
     if trial.state == TrialState.RUNNING:
         study.tell(number, state=TrialState.FAIL)
@@ -187,7 +190,7 @@ def run_workers(job: Job, n: int) -> int:
 
 
 def _watch(workers: Sequence[BaseProcess]) -> None:
-    """Wait for all, and tell of one that dies."""
+    """Wait for all workers, and report each one that dies."""
     waiting = list(workers)
     while waiting:
         for worker in [w for w in waiting if not w.is_alive()]:
@@ -202,7 +205,7 @@ def _watch(workers: Sequence[BaseProcess]) -> None:
 
 
 def _stop(workers: Sequence[BaseProcess]) -> None:
-    """Let every worker put its trial back; an impatient second Ctrl-C must not leave them behind."""
+    """Let every worker put its trial back; a second Ctrl-C is ignored meanwhile, so that no worker is left running."""
     before = {number: signal.signal(number, _stopping) for number in (signal.SIGINT, signal.SIGTERM)}
     for worker in workers:
         if worker.is_alive():
@@ -210,17 +213,17 @@ def _stop(workers: Sequence[BaseProcess]) -> None:
     for worker in workers:
         worker.join(STOP_SECONDS)
         if worker.is_alive():
-            worker.kill()  # its trial is run again for want of signs of life
+            worker.kill()  # without a heartbeat its trial will be run again
     for number, handler in before.items():
         signal.signal(number, handler)
 
 
 def _main(job: Job, index: int) -> None:
-    """A worker process: one thread, stops once and tidily, mistakes in one line."""
+    """Main function of a worker process: one thread, one orderly stop, user errors in one line."""
     os.environ["OMP_NUM_THREADS"] = "1"
     th.set_num_threads(1)
     signal.signal(signal.SIGTERM, _interrupt_once)
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # in a script's background Ctrl-C is not meant for us
+    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # a script in the background ignores Ctrl-C
         signal.signal(signal.SIGINT, _interrupt_once)
     try:
         work(job, index)
@@ -235,11 +238,11 @@ def _main(job: Job, index: int) -> None:
 
 
 def _interrupt_once(number: int, frame: FrameType | None) -> None:
-    """A terminal sends Ctrl-C to every process and the parent passes on a stop: only the first may interrupt."""
+    """Interrupt at the first signal only: both the terminal and the parent process may send one."""
     signal.signal(signal.SIGTERM, _stopping)
     signal.signal(signal.SIGINT, _stopping)
     raise KeyboardInterrupt
 
 
 def _stopping(number: int, frame: FrameType | None) -> None:
-    """Stopping has begun already."""
+    """Ignore further signals while stopping."""

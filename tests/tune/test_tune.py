@@ -279,7 +279,7 @@ def test_a_dead_workers_trial_is_run_again_and_counted_once(tmp_path: Path, monk
     quick(monkeypatch, lambda spec, folder, after_eval: None)
     assert tune.main(arguments(tmp_path, "--n-trials", "1", *SHORT, *TINY)) == 0
     study = load(tmp_path)
-    dead = study.ask()  # a worker takes a trial, shows a sign of life, and is killed
+    dead = study.ask()  # a worker takes a trial, writes a heartbeat, and is killed
     dead.suggest_float("tau", 5e-5, 0.5, log=True)
     study._storage.record_heartbeat(dead._trial_id)  # type: ignore[attr-defined]
     sign = tmp_path / NAME / "journal.log.alive" / f"trial_{dead._trial_id}"
@@ -306,7 +306,7 @@ def test_a_worker_thought_dead_does_not_count_twice(
 
     quick(monkeypatch, declared_dead)
     assert tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY)) == 0
-    assert "trial 0 was given to another worker" in capsys.readouterr().out
+    assert "trial 0 is dropped here: another worker has it" in capsys.readouterr().out
     states = [t.state for t in load(tmp_path).trials]
     assert states == [TrialState.FAIL, TrialState.COMPLETE, TrialState.COMPLETE]
 
