@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import onnx
@@ -30,7 +31,7 @@ class _Graph:
         self.constants[name] = numpy_helper.from_array(array, name)
         return name
 
-    def __call__(self, op: str, *inputs: str, name: str | None = None, **attributes: int | Sequence[int]) -> str:
+    def __call__(self, op: str, *inputs: str, name: str | None = None, **attributes: Any) -> str:
         output = name or f"t{len(self.nodes)}"
         self.nodes.append(helper.make_node(op, list(inputs), [output], **attributes))
         return output

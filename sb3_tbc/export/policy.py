@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, cast
 
 import numpy as np
 import torch as th
@@ -183,7 +183,8 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     needed = rules.window_end == "reached" or layout.relative_subgoals
     if subgoals.rotations and rules.window_end == "reached":
         raise ConfigError("window_end='reached' with subgoals that are compared by angle cannot be exported")
-    high, low = model.high.policy.average_actor, model.low.policy.average_actor
+    high: MLPActor | NDBCActor | _MLPActor = model.high.policy.average_actor
+    low = model.low.policy.average_actor
     if model.foreign_high is not None:
         high = _foreign_actor(model.foreign_high)
     if isinstance(high, NDBCActor):
@@ -241,9 +242,17 @@ def _actions(actor: MLPActor | NDBCActor) -> int:
 class _MLPActor(Protocol):
     """What an MLP actor has, ours or SB3's."""
 
-    activation_fn: type[nn.Module]
-    latent_pi: nn.Module
-    mu: nn.Module
+    @property
+    def activation_fn(self) -> type[nn.Module]:
+        """Kind of the hidden layers' activation."""
+
+    @property
+    def latent_pi(self) -> nn.Module:
+        """Hidden layers."""
+
+    @property
+    def mu(self) -> nn.Module:
+        """Layer of the means."""
 
 
 def _bound(actor: object) -> float:
@@ -261,7 +270,7 @@ def _foreign_actor(algorithm: BaseAlgorithm) -> _MLPActor:
 
     actor = getattr(algorithm.policy, "actor", None)
     if isinstance(actor, SACActor | TQCActor) and not actor.use_sde:
-        return actor
+        return cast(_MLPActor, actor)
     raise ConfigError(
         f"the policy of {type(algorithm).__name__} cannot be exported as a high level; SAC's and TQC's can"
     )
@@ -271,7 +280,7 @@ def _read_mlp(actor: _MLPActor) -> MLP:
     if actor.activation_fn not in ACTIVATIONS:
         allowed = ", ".join(ACTIVATIONS.values())
         raise ConfigError(f"only networks with {allowed} can be exported, this one has {actor.activation_fn.__name__}")
-    layers = [m for m in actor.latent_pi.modules() if isinstance(m, nn.Linear)] + [actor.mu]
+    layers = [m for m in (*actor.latent_pi.modules(), actor.mu) if isinstance(m, nn.Linear)]
     weights = tuple(_numpy(layer.weight).T.copy() for layer in layers)
     return MLP(weights, tuple(_numpy(layer.bias) for layer in layers), ACTIVATIONS[actor.activation_fn])
 

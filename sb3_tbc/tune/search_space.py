@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
@@ -88,7 +88,7 @@ class Parameter:
         """Dotted configuration keys for a value."""
         return dict(self.sets[value]) if self.sets else dict.fromkeys(self.keys, value)
 
-    def holds(self, value: object) -> bool:
+    def holds(self, value: object) -> TypeGuard[str | float]:
         """Whether a value lies in the range or among the choices."""
         if self.choices:
             return value in self.choices
@@ -382,7 +382,7 @@ def complete(run: RunConfig, action_dim: int) -> RunConfig:
     :param action_dim: size of the task's actions, which is the default number of motor neurons
     """
     circuit = read_key(run, CIRCUIT)
-    if circuit is None:
+    if not isinstance(circuit, Mapping):
         return run
     written = CircuitConfig.from_dict({**circuit, "motor": circuit.get("motor") or action_dim}).to_dict()
     return replace(run, model=merge(run.model, {"low": {"policy_kwargs": {"ndbc": written}}}))
