@@ -7,7 +7,8 @@ refused in one line. Success is not the point: 1,500 steps teach nothing. Exampl
     python scripts/goal_environments.py --output docs/goal_environments.md
 
 By default one id of each family and kind of reward is tried (the newest version, the smallest maze); ``--all`` tries
-every id. Packages that are not installed are left out.
+every id. Packages that are not installed are left out. What was found is kept in a file (``--results``), so that a
+stopped run goes on where it was; ``--again`` tries what is in the file once more.
 """
 
 from __future__ import annotations
@@ -33,12 +34,17 @@ from sb3_tbc.tasks.foreign import import_quietly
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 
 PACKAGES = {"gymnasium_robotics": "Gymnasium-Robotics", "panda_gym": "panda-gym", "highway_env": "highway-env"}
+STAGES = ("training", "evaluating", "filming", "exporting")
 TINY = (
     "gradient_ratio:0.02", "low.batch_size:16", "high.batch_size:16", "compile:false", "subgoals.n_probe_steps:300",
 )  # fmt: skip
 LIMIT = 100
 """Time limit for environments that come without one, environment steps."""
 SECONDS = 900
+"""A trial that takes longer is ended."""
+BROKEN = ("TRACEBACK", "DIED", "TIMEOUT")
+"""Begins what is said of a trial that neither worked nor was refused."""
+RESULTS = Path(__file__).parents[1] / "docs" / "goal_environments.json"
 
 
 def goal_ids() -> list[str]:
@@ -160,35 +166,44 @@ def run(env_id: str) -> dict[str, Any]:
 
 def row(result: dict[str, Any], alike: Sequence[str]) -> str:
     """One line of the table."""
-    name = result["id"].partition(":")[2] + (f" (limit of {LIMIT} steps added)" if result.get("limit") else "")
+    name = f"`{result['id'].partition(':')[2]}`" + (f" (limit of {LIMIT} steps added)" if result.get("limit") else "")
     others = len(alike) - 1
-    stages = [result.get(stage, "-") for stage in ("training", "evaluating", "filming", "exporting")]
+    stages = [result.get(stage, "-") for stage in STAGES]
     if stages[0] not in ("yes", "-"):
-        said = stages[0].partition("cannot be used as a goal environment: ")[2] or stages[0]
-        broken = said.startswith(("TRACEBACK", "DIED", "TIMEOUT"))
-        cells = [("" if broken else "refused: ") + said.replace("|", "/"), "", "", ""]
+        said = re.sub(r"^.*cannot be used( as a goal environment)?: ", "", stages[0])
+        cells = [("" if said.startswith(BROKEN) else "refused: ") + said.replace("|", "/"), "", "", ""]
     else:
         cells = [stage if stage == "yes" else f"no: {stage}" for stage in stages]
         if result.get("difference"):
             cells[3] = f"yes, within {result['difference']}"
-    return f"| `{name}` | {others or ''} | {' | '.join(cells)} |"
+    return f"| {name} | {others or ''} | {' | '.join(cells)} |"
 
 
-def page(rows: Sequence[tuple[str, str]], skipped: Sequence[str], missing: int) -> str:
+def summary(results: Sequence[dict[str, Any]]) -> str:
+    """How many of the trials worked, and how many were refused."""
+    whole = sum(all(result.get(stage) == "yes" for stage in STAGES) for result in results)
+    refused = sum(result["training"] != "yes" and not result["training"].startswith(BROKEN) for result in results)
+    broken = len(results) - whole - refused
+    rest = f", {broken} are broken" if broken else ""
+    return f"Of {len(results)} families tried, {whole} do all four, {refused} are refused{rest}."
+
+
+def page(rows: Sequence[tuple[str, str]], skipped: Sequence[str], missing: int, said: str = "") -> str:
     """The table as a page.
 
     :param rows: module and line
     :param skipped: packages that are not installed
     :param missing: families still to be tried
+    :param said: a summary
     """
     head = (
-        "---\norphan: true\n---\n\n# Goal environments of other packages\n\n"
+        "# Goal environments of other packages\n\n"
         "Made by `python scripts/goal_environments.py --output docs/goal_environments.md`. Each environment trained\n"
         "for 1,500 steps with tiny settings, was evaluated, filmed and exported with `--check`; or it was refused in\n"
         "one line. One id stands for its family and kind of reward; the second column counts the ids like it.\n"
         "*exports* says how much the actions of the NumPy policy differ from the agent's at most.\n"
     )
-    parts = [head]
+    parts = [head, f"\n{said}\n"] if said else [head]
     for module, package in PACKAGES.items():
         lines = [line for home, line in rows if home == module]
         if lines:
@@ -206,6 +221,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, help="the page to write; by default it is printed")
     parser.add_argument("--all", action="store_true", help="try every id, not one of each family")
+    parser.add_argument("--results", type=Path, default=RESULTS, metavar="FILE", help="(default: %(default)s)")
+    parser.add_argument("--again", action="store_true", help="try those ids, too, whose results are known")
+    parser.add_argument("--most", type=int, metavar="N", help="stop after so many ids; the next call goes on")
     parser.add_argument("--only", default="", metavar="TEXT", help="ids that contain this text")
     parser.add_argument("--one", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -223,15 +241,18 @@ def main() -> None:
             skipped.append(package)
     ids = [env_id for env_id in goal_ids() if args.only in env_id]
     chosen = {env_id: [env_id] for env_id in ids} if args.all else one_of_each(ids)
-    rows = []
-    for env_id, alike in chosen.items():
-        result = run(env_id)
-        rows.append((env_id.partition(":")[0], row(result, alike)))
-        print(json.dumps(result), file=sys.stderr, flush=True)
-        if args.output is not None:  # after each, because the whole takes an hour
-            args.output.write_text(page(rows, skipped, len(chosen) - len(rows)), encoding="utf-8")
+    found: dict[str, dict[str, Any]] = json.loads(args.results.read_text()) if args.results.is_file() else {}
+    waiting = [env_id for env_id in chosen if args.again or env_id not in found]
+    for env_id in waiting[: args.most]:
+        found[env_id] = run(env_id)
+        print(json.dumps(found[env_id]), file=sys.stderr, flush=True)
+        args.results.write_text(json.dumps(dict(sorted(found.items())), indent=1) + "\n", encoding="utf-8")
+    rows = [(i.partition(":")[0], row(found[i], alike)) for i, alike in chosen.items() if i in found]
+    text = page(rows, skipped, len(chosen) - len(rows), summary([found[i] for i in chosen if i in found]))
     if args.output is None:
-        print(page(rows, skipped, 0))
+        print(text)
+    else:
+        args.output.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

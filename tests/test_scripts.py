@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import json
 from pathlib import Path
 from types import ModuleType
 
@@ -52,6 +53,15 @@ def test_one_id_stands_for_its_family_and_kind_of_reward() -> None:
     assert len(chosen["gymnasium_robotics:PointMaze_UMaze-v3"]) == 2
 
 
+def test_the_committed_table_is_that_of_the_committed_results() -> None:
+    results = json.loads((SCRIPTS.parent / "docs" / "goal_environments.json").read_text())
+    page = (SCRIPTS.parent / "docs" / "goal_environments.md").read_text()
+    assert script("goal_environments").summary(list(results.values())) in page
+    for result in results.values():
+        assert f"`{result['id'].partition(':')[2]}`" in page
+        assert not [said for said in result.values() if str(said).startswith(("TRACEBACK", "DIED", "TIMEOUT"))]
+
+
 def test_the_table_says_what_happened() -> None:
     table = script("goal_environments")
     well = {"id": "panda_gym:A-v1", "training": "yes", "evaluating": "yes", "filming": "yes", "exporting": "yes"}
@@ -63,7 +73,8 @@ def test_the_table_says_what_happened() -> None:
     lines = [("panda_gym", table.row({**w, **extra}, ["a", "b"])) for w, extra in (
         (well, {"difference": "1e-07"}), (refused, {}), (died, {}),
     )]  # fmt: skip
-    text = table.page(lines, ["highway-env"], 2)
+    text = table.page(lines, ["highway-env"], 2, table.summary([well, refused, died]))
+    assert "Of 3 families tried, 1 do all four, 1 are refused, 1 are broken." in text
     assert "| `A-v1` | 1 | yes | yes | yes | yes, within 1e-07 |" in text
     assert "| `B-v1` | 1 | refused: its reward is x/y |" in text
     assert "| `C-v1` | 1 | DIED with code -9" in text

@@ -106,18 +106,12 @@ def make_envs(env_id: str, n_envs: int, seed: int | None, env_kwargs: PlainMappi
     """
     try:
         kwargs = dict(env_kwargs or {})
-        env = make_vec_env(partial(make_env, env_id), n_envs, seed=seed, env_kwargs=kwargs, vec_env_cls=GoalVecEnv)
+        return make_vec_env(partial(make_env, env_id), n_envs, seed=seed, env_kwargs=kwargs, vec_env_cls=GoalVecEnv)
     except ConfigError:
         raise
     except Exception as error:  # An environment's own code may fail in any way.
         given = f" with {dict(env_kwargs)}" if env_kwargs else ""
         raise ConfigError(f"cannot make environment {env_id!r}{given}: {_cause(error)}") from error
-    try:
-        check_goal_env(env, env_id)
-    except ConfigError:
-        env.close()
-        raise
-    return env
 
 
 def _cause(error: Exception) -> str:
@@ -137,7 +131,8 @@ def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: An
     :param env_id: as registered, with its module if it has one
     :param subgoals: arguments of :class:`~sb3_tbc.tasks.generic.DescribedGoalEnv`
     :param env_kwargs: arguments of ``gymnasium.make``
-    :raises ConfigError: if its module cannot be imported, or ``subgoals`` is given although it defines its own
+    :raises ConfigError: if its module cannot be imported, it is no goal environment, its actions are not a Box, or
+        ``subgoals`` is given although it defines its own
     """
     module = env_id.rpartition(":")[0]
     if module:
@@ -147,11 +142,14 @@ def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: An
         env = gym.make(env_id, **{"render_mode": "rgb_array", **env_kwargs})
     except TypeError:
         env = gym.make(env_id, **env_kwargs)
+    try:
+        check_goal_env(env, env_id)  # before a vector is made of it, which fails on spaces within spaces
+    except ConfigError:
+        env.close()
+        raise
     if hasattr(env.unwrapped, "subgoals"):
         if subgoals:
             raise ConfigError(f"{env_id!r} defines its own subgoal space; leave out `subgoals`, got {dict(subgoals)}")
-        return env
-    if goal_space_problems(env.observation_space, env.action_space):  # check_goal_env reports them
         return env
     made_alike = repr((env.spec, sorted(env_kwargs.items()), sorted((subgoals or {}).items())))
     env = described = DescribedGoalEnv(env, description=_DESCRIPTIONS.get(made_alike), **(subgoals or {}))
@@ -159,7 +157,7 @@ def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: An
     return env
 
 
-def check_goal_env(env: VecEnv, env_id: str) -> None:
+def check_goal_env(env: Env, env_id: str) -> None:
     """Refuse environments in which a hierarchical agent cannot act.
 
     :raises ConfigError: naming what is missing

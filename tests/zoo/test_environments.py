@@ -63,6 +63,27 @@ def test_what_to_install_without_gymnasium_robotics(monkeypatch: pytest.MonkeyPa
         resolve_env("FetchReach-v4")
 
 
+class Nested(gym.Env[Any, Any]):
+    """Goals are dictionaries, as in FrankaKitchen."""
+
+    inner = gym.spaces.Dict({"kettle": gym.spaces.Box(-1, 1, (2,))})
+    observation_space = gym.spaces.Dict(
+        {"observation": gym.spaces.Box(-1, 1, (2,)), "achieved_goal": inner, "desired_goal": inner}
+    )
+    action_space = gym.spaces.Box(-1, 1, (1,))
+
+
+def test_spaces_within_spaces_are_refused_before_a_vector_is_made_of_them() -> None:
+    gym.register("Nested-v0", Nested)
+    try:
+        with pytest.raises(
+            ConfigError, match=r"'Nested-v0' cannot be used: its observation\['achieved_goal'\] must be"
+        ):
+            make_envs("Nested-v0", 1, 0)
+    finally:
+        del gym.registry["Nested-v0"]
+
+
 def test_errors_of_an_environment_take_one_line(broken_id: str) -> None:
     with pytest.raises(ConfigError, match=r"AssertionError in test_environments.py, line \d+: assert"):
         make_envs(broken_id, 1, 0)
