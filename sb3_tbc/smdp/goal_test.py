@@ -58,9 +58,10 @@ def goal_test_of(venv: VecEnv) -> GoalTest:
     return GoalTest(reward, terminated if venv.has_attr("compute_terminated") else as_good_as_the_goal)
 
 
-def check_goal_test(venv: VecEnv) -> None:
+def check_goal_test(venv: VecEnv, infos: list[Plain] | None = None) -> None:
     """Try the calls that learning makes, on goals from the task's own goal space, before anything is learnt.
 
+    :param infos: tried, too, as ``info``: SB3's hindsight replay gives a list of them, one for each goal
     :raises ConfigError: if the task does not have the functions, or they do not take batches
     """
     if not venv.has_attr("compute_reward"):
@@ -75,13 +76,16 @@ def check_goal_test(venv: VecEnv) -> None:
         test = goal_test_of(venv)
         test.reward(achieved, desired)
         test.terminated(achieved, desired)
+        if infos is not None:
+            venv.env_method("compute_reward", achieved, desired, infos, indices=[0])
     except (ConfigError, NonFiniteError):
         raise
     except Exception as error:  # a task's own code may fail in any way
         raise ConfigError(
-            f"compute_reward or compute_terminated fails on a batch of {TRIED} goals with an empty info: "
-            f"{type(error).__name__}: {error}. Learning in hindsight asks for rewards of goals that were never the "
-            "task's, of whose steps there is no info"
+            f"compute_reward or compute_terminated fails on a batch of {TRIED} goals with an empty info"
+            f"{'' if infos is None else ', or a list of empty ones as SB3 gives it'}: {type(error).__name__}: {error}. "
+            "Learning in hindsight asks for rewards of goals that were never the task's, of whose steps there is no "
+            "info: let them depend on the goals alone"
         ) from error
 
 

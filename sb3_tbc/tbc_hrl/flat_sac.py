@@ -21,7 +21,7 @@ from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.both_levels import MORE
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_spaces import check_goal_space
-from sb3_tbc.smdp.goal_test import check_goal_test
+from sb3_tbc.smdp.goal_test import TRIED, check_goal_test
 from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.smdp.guard import GuardedVecEnv, OnBadStep
 from sb3_tbc.smdp.hindsight import check_goal_strategy
@@ -97,7 +97,7 @@ class FlatSAC(PlainAlgorithm, SAC):
         )
         if self.env is not None:
             check_goal_space(self.env.observation_space, self.env.action_space)
-            check_goal_test(self.env)
+            check_goal_test(self.env, infos=[{}] * TRIED)
         if by_event and self.env is not None:
             check_goal_strategy(config.goal_strategy, attribute_of(self.env, "subgoals"))
         if sb3._init_setup_model:

@@ -5,10 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import pytest
 from corridor import Corridor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.smdp.goal_test import check_goal_test, goal_test_of
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 
 
 class OneAtATime(Corridor):
@@ -26,3 +29,19 @@ def test_an_answer_for_one_pair_is_not_taken_for_all() -> None:
     np.testing.assert_array_equal(test.terminated(achieved, desired), [True, False, True])
     np.testing.assert_array_equal(test.terminated(achieved[:1], desired[:1]), [True])
     np.testing.assert_array_equal(test.reward(achieved, desired), [0.0, -1.0, 0.0])
+
+
+class ReadsInfo(Corridor):
+    """Works with one empty info, not with a list of them."""
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        return super().compute_reward(achieved_goal, desired_goal, info) - info.get("cost", 0.0)
+
+
+def test_a_list_of_infos_is_tried_where_learning_gives_one() -> None:
+    """SB3's hindsight replay does; that it fails must not be found out after the first episode."""
+    check_goal_test(DummyVecEnv([ReadsInfo]))
+    with pytest.raises(ConfigError, match="a list of empty ones as SB3 gives it: AttributeError"):
+        check_goal_test(DummyVecEnv([ReadsInfo]), infos=[{}] * 3)
+    with pytest.raises(ConfigError, match="a list of empty ones"):
+        FlatSAC("MultiInputPolicy", ReadsInfo())
