@@ -4,15 +4,15 @@
 The low level of a trained agent stays as it is; each algorithm learns to choose its subgoals and time budgets from
 nothing, and is evaluated as a whole agent. Example::
 
-    python scripts/high_levels.py results/Pendulum/model.zip --options 3000 --seeds 0 1 2
+    python scripts/high_levels.py pretrained:Pendulum --options 3000 --seeds 0 1 2
 
-Prints one line per algorithm and seed, and the agent's own high level for comparison.
+Prints one line per algorithm and seed, the mean over seeds with its interval, and the agent's own high level for
+comparison.
 """
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 from typing import Any
 
 import torch as th
@@ -23,6 +23,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.evaluate import identify
+from sb3_tbc.pretrained import model_path
+from sb3_tbc.stats import bootstrap_mean
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.option_env import OptionEnv
 from sb3_tbc.zoo.algorithms import load_two_levels
@@ -59,7 +61,7 @@ def train(name: str, agent: TBCHRL, info: dict[str, Any], options: int, seed: in
 def main() -> None:
     """Compare; see the module's text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path, metavar="MODEL.zip", help="a trained agent with two levels")
+    parser.add_argument("model", type=model_path, metavar="MODEL", help="a trained agent's .zip, or pretrained:TASK")
     parser.add_argument("--algorithms", nargs="+", choices=sorted(ALGORITHMS), default=["SAC", "TQC", "CrossQ"])
     parser.add_argument("--options", type=int, default=3000, help="options to learn from (default: %(default)s)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0], help="seeds of the high levels (default: 0)")
@@ -69,9 +71,12 @@ def main() -> None:
     info, agent = identify(args.model, None), load_two_levels(args.model, trust=args.trust)
     print(f"{'own high level':16} success {success(agent, info, 0):.2f} in {EPISODES} episodes")
     for name in args.algorithms:
+        rates = []
         for seed in args.seeds:
-            rate = success(train(name, agent, info, args.options, seed), info, seed)
-            print(f"{name:9} seed {seed}  success {rate:.2f} after {args.options} options", flush=True)
+            rates.append(success(train(name, agent, info, args.options, seed), info, seed))
+            print(f"{name:9} seed {seed}  success {rates[-1]:.2f} after {args.options} options", flush=True)
+        mean = bootstrap_mean(rates)
+        print(f"{name:9} mean    success {mean.mean:.2f} [{mean.low:.2f}, {mean.high:.2f}]", flush=True)
 
 
 if __name__ == "__main__":
