@@ -1,8 +1,10 @@
 """Hierarchical reinforcement learning with timed subgoals and bionic circuit networks, on Stable-Baselines3."""
 
 from sb3_tbc import former_names
+from sb3_tbc.hub import load_from_hub, push_to_hub
 from sb3_tbc.ndbc import NDBCNet, NDBCWiring
 from sb3_tbc.pretrained import load_pretrained
+from sb3_tbc.recurrent import NDBCSAC
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.smdp import HierarchicalVecEnv
 from sb3_tbc.smdp.spaces import SubgoalSpace
@@ -14,6 +16,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "HAC",
+    "NDBCSAC",
     "TBCHRL",
     "HiTS",
     "HierarchicalVecEnv",
@@ -24,7 +27,9 @@ __all__ = [
     "SubgoalSpace",
     "TBCPolicy",
     "evaluate_hierarchical",
+    "load_from_hub",
     "load_pretrained",
+    "push_to_hub",
 ]
 
 former_names.install()

@@ -46,11 +46,10 @@ class NDBCExtractor(BaseFeaturesExtractor):
         boxes = [part for part in parts if isinstance(part, spaces.Box)]
         if len(boxes) < len(parts):
             raise ValueError(f"NDBCExtractor takes a Box or a Dict of Boxes, got {observation_space}")
-        bounds = np.concatenate([np.maximum(np.abs(box.low), np.abs(box.high)).ravel() for box in boxes])
-        usable = np.isfinite(bounds) & (bounds > 0) & (bounds < 1e6)
-        scale = np.where(usable, bounds, 1.0).tolist() if input_scale is None else input_scale
-        drawn = NDBCWiring(len(bounds), **(DEFAULT_NUMBERS | dict(wiring or {})))
-        self.net = NDBCNet(len(bounds), features_dim, drawn, input_scale=scale, **kwargs)
+        natural = [number for box in boxes for number in input_scale_of(box)]
+        drawn = NDBCWiring(len(natural), **(DEFAULT_NUMBERS | dict(wiring or {})))
+        scale = natural if input_scale is None else input_scale
+        self.net = NDBCNet(len(natural), features_dim, drawn, input_scale=scale, **kwargs)
 
     def forward(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
         """Features ``(batch, features_dim)``."""
@@ -58,6 +57,14 @@ class NDBCExtractor(BaseFeaturesExtractor):
             observations = th.cat([part.flatten(1) for part in observations.values()], dim=1)
         features: th.Tensor = self.net(observations.flatten(1))[0]
         return features
+
+
+def input_scale_of(box: spaces.Box) -> list[float]:
+    """What each number of an observation is divided by: its largest bound, or 1 where it has no sensible one."""
+    bounds = np.maximum(np.abs(box.low), np.abs(box.high)).ravel()
+    usable = np.isfinite(bounds) & (bounds > 0) & (bounds < 1e6)
+    scale: list[float] = np.where(usable, bounds, 1.0).tolist()
+    return scale
 
 
 DEFAULT_NUMBERS = {

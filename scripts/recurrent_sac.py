@@ -1,0 +1,134 @@
+#!/usr/bin/env python
+"""Compare memoryless SAC and NDBCSAC on Pendulum without velocities, and write the table of docs/recurrent_sac.md.
+
+``Pendulum-v1`` shows cosine, sine and velocity; here the velocity is hidden. Every agent gets the same number of steps
+and updates, networks of the same width, and the same 50 evaluation episodes. Example::
+
+    python scripts/recurrent_sac.py --output docs/recurrent_sac.md
+
+Each finished run is kept in a file (``--results``), so that a stopped comparison goes on where it was; the settings
+are those that rl-zoo3 has for Pendulum and SAC, where it has any; the rest was tried on seed 10.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from gymnasium.wrappers import FrameStackObservation, TransformObservation
+from stable_baselines3 import SAC
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+
+from sb3_tbc import NDBCSAC
+from sb3_tbc.aliases import Env, Plain
+from sb3_tbc.files import write_atomic
+from sb3_tbc.stats import bootstrap_mean
+
+DOCS = Path(__file__).parents[1] / "docs"
+NAMES = {
+    "sac": "SAC, memoryless",
+    "ndbc": "NDBCSAC, NDBC circuit",
+    "gru": "NDBCSAC, GRU",
+    "stacked": "SAC, last three observations",
+    "full": "SAC that sees the velocity",
+}
+SHARED: Plain = {"learning_rate": 1e-3, "learning_starts": 1000, "train_freq": 2, "gradient_steps": 1, "device": "cpu"}
+SEQUENCES: Plain = {"sequence_length": 8, "burn_in": 3}
+"""Of a Pendulum's past, three steps say everything."""
+N_SEQUENCES = 32
+BATCH = N_SEQUENCES * (SEQUENCES["sequence_length"] - SEQUENCES["burn_in"])
+"""Transitions of each update, for all agents."""
+EVERY = 2500
+EPISODES = 50
+
+
+def make_task(kind: str = "sac") -> Env:
+    """Pendulum without velocities; for the references, with them or with the last three observations."""
+    env: Env = gym.make("Pendulum-v1")
+    if kind == "full":
+        return env
+    box = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    env = TransformObservation(env, lambda observation: observation[:2], box)
+    return FrameStackObservation(env, 3) if kind == "stacked" else env
+
+
+def make_agent(kind: str, seed: int) -> SAC:
+    """An agent of one kind, untrained."""
+    env = make_vec_env(lambda: make_task(kind), 1, seed=seed)
+    if kind in ("ndbc", "gru", "ltc", "cfc"):
+        policy = {"net_arch": [64, 64], "cell": kind}
+        own: Plain = {"batch_size": N_SEQUENCES, "replay_buffer_kwargs": SEQUENCES, "policy_kwargs": policy}
+        return NDBCSAC("MlpPolicy", env, seed=seed, **own, **SHARED)
+    return SAC("MlpPolicy", env, batch_size=BATCH, policy_kwargs={"net_arch": [64, 64]}, seed=seed, **SHARED)
+
+
+def trial(kind: str, seed: int, steps: int) -> Plain:
+    """Returns of an agent while it learns: mean return of each evaluation, the last one first in importance."""
+    start, agent, returns = time.process_time(), make_agent(kind, seed), []
+    for _ in range(steps // EVERY):
+        agent.learn(EVERY, reset_num_timesteps=False)
+        test = make_vec_env(lambda: make_task(kind), 10, seed=1_000_000)
+        returns.append(round(float(evaluate_policy(agent, test, EPISODES)[0]), 1))  # type: ignore[arg-type]
+        print(kind, seed, agent.num_timesteps, returns[-1], file=sys.stderr, flush=True)
+    seconds = round(time.process_time() - start)
+    parameters = sum(p.numel() for p in agent.actor.parameters())
+    return {"returns": returns, "updates": agent._n_updates, "seconds": seconds, "actor_parameters": parameters}
+
+
+def table(found: dict[str, Plain], seeds: Sequence[int], steps: int) -> str:
+    """The runs of each kind of agent, as Markdown."""
+    lines = ["| agent | actor's parameters | return | half way | seconds of CPU |", "|---|---|---|---|---|"]
+    for kind, name in NAMES.items():
+        runs = [found[key] for key in (f"{kind} {seed} {steps}" for seed in seeds) if key in found]
+        if runs:
+            last, half = (
+                bootstrap_mean([run["returns"][at] for run in runs]) for at in (-1, len(runs[0]["returns"]) // 2 - 1)
+            )
+            cells = [f"{x.mean:.0f} [{x.low:.0f}, {x.high:.0f}]" for x in (last, half)]
+            seconds = np.mean([run["seconds"] for run in runs])
+            lines.append(f"| {name} | {runs[0]['actor_parameters']} | {' | '.join(cells)} | {seconds:.0f} |")
+    return "\n".join(lines)
+
+
+def update(page: Path, text: str) -> None:
+    """Put the table into the page, between its marks."""
+    old = page.read_text(encoding="utf-8")
+    new = re.sub(r"(<!-- table -->\n).*?(\n<!-- end -->)", lambda m: m[1] + text + m[2], old, flags=re.DOTALL)
+    write_atomic(page, new)
+
+
+def main() -> None:
+    """Compare; see the module's text."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kinds", nargs="+", choices=[*NAMES, "ltc", "cfc"], default=list(NAMES))
+    parser.add_argument("--seeds", type=int, nargs="+", default=list(range(5)))
+    parser.add_argument("--steps", type=int, default=15_000, help="environment steps (default: %(default)s)")
+    parser.add_argument("--results", type=Path, default=DOCS / "recurrent_sac.json", help="(default: %(default)s)")
+    parser.add_argument("--output", type=Path, help="the page whose table is renewed; by default it is printed")
+    parser.add_argument("--most", type=int, metavar="N", help="stop after so many runs; the next call goes on")
+    args = parser.parse_args()
+    th.set_num_threads(1)
+    found: dict[str, Any] = json.loads(args.results.read_text()) if args.results.is_file() else {}
+    waiting = [(kind, seed) for seed in args.seeds for kind in args.kinds if f"{kind} {seed} {args.steps}" not in found]
+    for kind, seed in waiting[: args.most]:
+        found[f"{kind} {seed} {args.steps}"] = trial(kind, seed, args.steps)
+        write_atomic(args.results, json.dumps(dict(sorted(found.items())), indent=1) + "\n")
+    text = table(found, args.seeds, args.steps)
+    if args.output is None:
+        print(text)
+    else:
+        update(args.output, text)
+
+
+if __name__ == "__main__":
+    main()
