@@ -1,4 +1,4 @@
-# From a fresh clone: `make train` or `make test`; nothing else is needed. `make help` lists the rest.
+# In a fresh clone run `make train` or `make test`; nothing else is needed. `make help` lists all targets.
 SHELL = /bin/bash
 PYTHON ?= python3
 VENV = .venv
@@ -22,10 +22,10 @@ help:
 	@echo "check-codestyle  format and lint, no change  commit-checks format type lint"
 	@echo "report           the results page of the docs and the HTML report, from the ledger in results/"
 	@echo "doc notebooks    build the pages, run the notebooks        bench  steps per second"
-	@echo "torture          kill, stop, starve and damage runs: the table of docs/reliability.md, hours"
+	@echo "torture          kill, stop and damage runs, for the table of docs/reliability.md; takes hours"
 	@echo "pretrained       train the agents that come with the package [TASKS=]"
 
-# The stamp is newer than the files that decide what is installed: nothing is done twice.
+# The stamp is newer than the files that determine what is installed, so nothing is installed twice.
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	@scripts/system-packages.sh
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)

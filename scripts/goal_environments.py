@@ -74,14 +74,14 @@ def _is_goal_env(env_id: str) -> bool:
 
 
 def family(env_id: str) -> tuple[str, bool]:
-    """What an id has in common with others: body and task, and whether its reward is dense."""
+    """Family of an id: body, task, and whether the reward is dense."""
     name = env_id.partition(":")[2].rsplit("-v", 1)[0]
     start = re.match(r"HandManipulate(Block|Egg|Pen)|[A-Za-z]+", name)
     return (start[0] if start else name).removesuffix("Dense"), "Dense" in name
 
 
 def one_of_each(ids: Sequence[str]) -> dict[str, list[str]]:
-    """The first id of each family, mazes by size, and the ids that it stands for."""
+    """The first id of each family (mazes by size), and the ids that it represents."""
     groups: dict[tuple[str, bool], list[str]] = {}
     for env_id in sorted(ids, key=lambda i: ("UMaze" not in i, len(i), i)):
         groups.setdefault(family(env_id), []).append(env_id)
@@ -92,7 +92,7 @@ def one_of_each(ids: Sequence[str]) -> dict[str, list[str]]:
 
 
 def attempt(env_id: str) -> dict[str, Any]:
-    """Train, evaluate, film and export; what each gave, or the line in which the environment was refused."""
+    """Train, evaluate, film and export; return the result of each step, or the message that refused the environment."""
     from sb3_tbc import evaluate, export, train
     from sb3_tbc.export.command import main as export_main
 
@@ -124,7 +124,7 @@ def attempt(env_id: str) -> dict[str, Any]:
 def _failed(
     result: dict[str, Any], stage: str, main: Callable[[Sequence[str]], int], argv: Sequence[str], printed: io.StringIO
 ) -> bool:
-    """Run a command; note what it said last if it failed."""
+    """Run a command; record its last line if it failed."""
     printed.truncate(0)
     try:
         code = main(argv)

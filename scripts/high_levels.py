@@ -50,7 +50,7 @@ def success(agent: TBCHRL, info: dict[str, Any], seed: int) -> float:
 
 
 def train(name: str, agent: TBCHRL, info: dict[str, Any], options: int, seed: int) -> TBCHRL:
-    """An agent whose high level learned for so many options."""
+    """An agent whose high level was trained on a number of options."""
     env = OptionEnv(vector(info, 4, seed), agent, seed=seed)
     shared = {"seed": seed, "gamma": agent.config.high.gamma, "policy_kwargs": {"net_arch": [64, 64]}}
     own = {"n_steps": 64} if name == "PPO" else {"learning_starts": 100, "train_freq": 1, "gradient_steps": 4}

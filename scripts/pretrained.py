@@ -68,7 +68,7 @@ def main() -> int:
 
 
 def trained(task: str, recipe: Recipe, runs: Path) -> Path:
-    """The agent of a finished run, which is started or gone on with where it is not there."""
+    """The agent of a finished run; the run is started or resumed if it is not finished."""
     folder = RunFolder.for_run(runs, task, recipe.algo, "full", recipe.seed)
     if not (folder.path / "final.json").is_file():
         going_on = ["--resume", str(folder.path)] if folder.path.is_dir() else []

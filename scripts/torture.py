@@ -1,4 +1,4 @@
-"""Rerun the table of docs/reliability.md: runs that are killed, stopped and starved, inputs that are nonsense.
+"""Rerun the table of docs/reliability.md: runs that are killed, stopped or out of disk space, and damaged inputs.
 
     python scripts/torture.py changes            killed before every system call that changes the run's folder
     python scripts/torture.py kill --number 100  kill -9 at random moments
@@ -59,14 +59,14 @@ def arguments_of(algo: str, n_envs: int, seed: int = 0) -> list[Any]:
 
 
 class Undisturbed:
-    """Runs that nothing happens to, each made once."""
+    """Undisturbed runs, each made once."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self._seconds: dict[tuple[str, int], float] = {}
 
     def get(self, algo: str, n_envs: int) -> tuple[Path, float]:
-        """Its folder, and how long it took."""
+        """Folder and duration of the undisturbed run."""
         root = self.root / f"whole-{algo}-{n_envs}"
         begun = time.monotonic()
         if (algo, n_envs) not in self._seconds:
@@ -137,13 +137,13 @@ def torture_kill(root: Path, number: int) -> tuple[int, int]:
 
 
 def torture_stop(root: Path, number: int) -> tuple[int, int]:
-    """Stopped at random moments; those that come before the command listens end it as any program."""
+    """Stopped at random moments; a signal before the command handles signals ends it like any program."""
     stops = [signal.SIGTERM, signal.SIGINT, signal.SIGHUP]
     return _struck(root, number or 50, stops, [130, 0, 1, 99, *(-stop for stop in stops)])
 
 
 def torture_disk(root: Path, number: int) -> tuple[int, int]:
-    """No file may grow beyond a limit: one line, the earlier checkpoint whole, and it goes on where there is room."""
+    """Limit the size of files: the run ends with one line, keeps its checkpoint, and resumes when there is room."""
     whole, _ = Undisturbed(root).get("tbc-hrl", 1)
     limits = [500, 5_000, 50_000, 90_000, 120_000, 150_000, 180_000, 220_000, 260_000, 300_000][: number or None]
     good = 0
@@ -183,7 +183,7 @@ def torture_twice(root: Path, number: int) -> tuple[int, int]:
 
 
 def torture_fuzz(root: Path, number: int) -> tuple[int, int]:
-    """Cut, flipped and made-up files: refused in one line or read, whatever is in them."""
+    """Truncated, altered and invented files: they are refused with one line or read."""
     whole, _ = Undisturbed(root).get("tbc-hrl", 1)
     rng, good, number = random.Random(0), 0, number or 1000
     model, checkpoint = whole / "model.zip", whole / "checkpoint"
@@ -219,7 +219,7 @@ def torture_fuzz(root: Path, number: int) -> tuple[int, int]:
 
 
 def _damaged(content: bytes, rng: random.Random) -> bytes:
-    """A file cut short, with flipped bits, or with a piece of itself in another place; never the file itself."""
+    """A damaged copy of a file: truncated, with flipped bits, or with a piece moved; never equal to the file."""
     changed = bytearray(content)
     way = rng.randrange(3)
     if way == 0:
@@ -245,7 +245,7 @@ TORTURES = {
 
 
 def main() -> int:
-    """Run what is asked for; 0 if all survived."""
+    """Run the requested tests; return 0 if all passed."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=[*TORTURES, "all"])
     parser.add_argument("--number", type=int, default=0, help="how many; by default as the table says")

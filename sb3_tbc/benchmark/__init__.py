@@ -1,1 +1,1 @@
-"""Timings of this package beside others, taken in turns in one run."""
+"""Timings of this package compared with others, measured in turns in one run."""

@@ -1,4 +1,4 @@
-"""What ``python -m sb3_tbc.benchmark cells`` measures."""
+"""Measurements of ``python -m sb3_tbc.benchmark cells``."""
 
 from __future__ import annotations
 
@@ -9,23 +9,28 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.aliases import Env, Plain, PlainMapping
 from sb3_tbc.benchmark.circuits import WIRING_NUMBERS
+from sb3_tbc.level.policies import NDBCActor
 from sb3_tbc.ndbc.closed_form import ClosedFormNDBC
 from sb3_tbc.ndbc.frozen import FrozenNDBC
 from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.ndbc.wiring import NDBCWiring
+from sb3_tbc.tbc_hrl import TBCHRL
 
 N_INPUTS, N_OUTPUTS = 10, 4
 ANT_FOUR_ROOMS = (12, 10, 8, 5, 8, 2, 6)  # table A1: the largest circuit, 30 neurons
 
-Job = Callable[[], Any]
+Job = Callable[[], object]
+
+Network = Callable[[th.Tensor], tuple[th.Tensor, object]]
+"""A recurrent network: outputs and state from a sequence."""
 
 
 class Candidate(NamedTuple):
@@ -39,7 +44,7 @@ class Candidate(NamedTuple):
 
 
 def in_turns(jobs: Mapping[str, Job], rounds: int, calls: int = 1) -> dict[str, list[float]]:
-    """CPU seconds per call of every job in every round; rounds go through all jobs, so that load spreads evenly."""
+    """CPU seconds per call of every job in every round; each round runs all jobs, so that load affects all alike."""
     for job in jobs.values():
         for _ in range(max(2, calls // 10)):
             job()
@@ -64,7 +69,7 @@ def ndbc_candidate(sub_steps: int, dynamics: str = "conductance", compiled: bool
     net = NDBCNet(N_INPUTS, N_OUTPUTS, wiring, sub_steps=sub_steps, dynamics=dynamics, seed=0)
     frozen = FrozenNDBC(net)
     x, state = np.zeros((1, N_INPUTS), np.float32), np.zeros((1, net.state_dim), np.float32)
-    run: Callable[..., Any] = th.compile(net, fullgraph=True, dynamic=False) if compiled else net
+    run: Network = th.compile(net, fullgraph=True, dynamic=False) if compiled else net
     label = f"NDBC K={sub_steps}" + (" dissipative" if dynamics != "conductance" else "")
     return Candidate(
         label + (" compiled" if compiled else ""), _count(net), _first(run),
@@ -73,7 +78,7 @@ def ndbc_candidate(sub_steps: int, dynamics: str = "conductance", compiled: bool
 
 
 def closed_form_candidate() -> Candidate:
-    """The same circuit through its closed form, NumPy, acting only."""
+    """The closed form of the same circuit, in NumPy, only for acting."""
     net = NDBCNet(N_INPUTS, N_OUTPUTS, NDBCWiring(N_INPUTS, *ANT_FOUR_ROOMS), seed=0)
     closed = ClosedFormNDBC(net)
     x, state = np.zeros((1, N_INPUTS), np.float32), np.zeros((1, net.state_dim), np.float32)
@@ -97,7 +102,7 @@ def gru_candidate() -> Candidate:
 
 
 def ncps_candidates() -> list[Candidate]:
-    """Wired LTC of ncps (6 unfolds) and CfC with 30 units; none where ncps is not installed."""
+    """Wired LTC of ncps (6 unfolds) and CfC with 30 units; empty if ncps is not installed."""
     if find_spec("ncps") is None:
         return []
     from ncps.torch import LTC, CfC
@@ -109,7 +114,7 @@ def ncps_candidates() -> list[Candidate]:
         x, state = th.zeros(1, 1, N_INPUTS), th.zeros(1, 30)
 
         @th.no_grad()
-        def step(net: nn.Module = net, x: th.Tensor = x, state: th.Tensor = state) -> Any:
+        def step(net: nn.Module = net, x: th.Tensor = x, state: th.Tensor = state) -> object:
             return net(x, state)
 
         trained = [p for p in net.parameters() if p.requires_grad]
@@ -211,17 +216,23 @@ def _straight_line(what: str, times: Mapping[int, float], unit: str) -> tuple[st
     return f"* {what}: {pairs} (R2 {r2:.3f})", {"sizes": x.tolist(), unit: y.tolist(), "r2": r2}
 
 
-def _small_agent(task: str, numbers: Sequence[int]) -> tuple[Any, Any]:
+def _small_agent(task: str, numbers: Sequence[int]) -> tuple[TBCHRL, Env]:
     """An untrained agent of a task with a circuit of these numbers, and the task."""
     import gymnasium as gym
 
     import sb3_tbc.tasks
-    from sb3_tbc.tbc_hrl import TBCHRL
 
     sb3_tbc.tasks.register_tasks()
-    env = gym.make(f"sb3_tbc/{task}-v0")
+    env: Env = gym.make(f"sb3_tbc/{task}-v0")
     circuit = {"policy_kwargs": {"ndbc": dict(zip(WIRING_NUMBERS, numbers, strict=True))}}
     return TBCHRL("MultiInputPolicy", env, seed=0, compile=False, low=circuit), env
+
+
+def _circuit(model: TBCHRL) -> NDBCNet:
+    actor = model.low.policy.average_actor
+    if not isinstance(actor, NDBCActor):
+        raise TypeError(f"expected a circuit as low level, got {type(actor).__name__}")
+    return actor.net
 
 
 def exported_steps() -> dict[int, float]:
@@ -238,7 +249,7 @@ def exported_steps() -> dict[int, float]:
             model, _ = _small_agent("Pendulum", (6 * size, 6 * size, size, 3 * size, 4, 1, 4))
             policy, path = extract(model), Path(folder) / f"policy{size}.c"
             path.write_text(to_c(policy), encoding="utf-8")
-            net = model.low.policy.average_actor.net
+            net = _circuit(model)
             times[net.wiring.n_synapses] = 1e6 * CPlayer(path, policy).low_step_seconds()
     return times
 
@@ -246,7 +257,7 @@ def exported_steps() -> dict[int, float]:
 def acting(rounds: int) -> tuple[str, dict[str, float]]:
     """Single deterministic steps of AntFourRooms' agent: the circuit, the low level around it, and ``predict``."""
     model, env = _small_agent("AntFourRooms", ANT_FOUR_ROOMS)
-    circuit, rng = FrozenNDBC(model.low.policy.average_actor.net), np.random.default_rng(0)
+    circuit, rng = FrozenNDBC(_circuit(model)), np.random.default_rng(0)
     observation, _ = env.reset(seed=0)
     _, state = model.predict(observation, None, deterministic=True)
     x, potentials = np.zeros((1, circuit.net.n_inputs), np.float32), np.zeros((1, circuit.state_dim), np.float32)
@@ -263,7 +274,7 @@ def acting(rounds: int) -> tuple[str, dict[str, float]]:
     return text, figures
 
 
-def _first(network: Callable[[th.Tensor], Any]) -> Callable[[th.Tensor], th.Tensor]:
+def _first(network: Network) -> Callable[[th.Tensor], th.Tensor]:
     """The network without the state it returns."""
 
     def run(inputs: th.Tensor) -> th.Tensor:

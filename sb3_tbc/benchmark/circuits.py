@@ -1,4 +1,4 @@
-"""The circuits that the configurations ship, and what ``python -m sb3_tbc.benchmark parameters`` measures of them."""
+"""The circuits of the shipped configurations, and their sizes for ``python -m sb3_tbc.benchmark parameters``."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ WIRING_NUMBERS = (
     "recurrent_command_synapses",
     "motor_fanin",
 )
-"""What the numbers of table A1 are, in order."""
+"""Meaning of the numbers of table A1, in order."""
 
 
 class ShippedCircuit(NamedTuple):
-    """The low level's circuit of a task, as a configuration ships it."""
+    """The low level's circuit of a task in a shipped configuration."""
 
     task: str
     config: str  # "paper" (table A1) or "tuned"
@@ -34,12 +34,12 @@ class ShippedCircuit(NamedTuple):
 
     @property
     def title(self) -> str:
-        """Task, and what is not table A1's."""
+        """Task; configuration and K if they are not those of table A1."""
         return self.task if self.config == "paper" else f"{self.task}, {self.config}, K = {self.sub_steps}"
 
 
 def shipped_circuits() -> list[ShippedCircuit]:
-    """Every task's circuit by table A1, followed by the tuned one where that is another."""
+    """Every task's circuit of table A1, followed by the tuned one if it differs."""
     found: list[ShippedCircuit] = []
     for task in PAPER_TASKS:
         paper, tuned = (_shipped_circuit(task, config) for config in ("paper", "tuned"))

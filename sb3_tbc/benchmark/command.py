@@ -1,11 +1,11 @@
-"""``python -m sb3_tbc.benchmark <what>``: timings of this package beside others, taken in turns in one run."""
+"""``python -m sb3_tbc.benchmark <what>``: timings of this package and of others, measured in turns in one run."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
@@ -14,6 +14,9 @@ from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
 from sb3_tbc.zoo.config import CONFIGS
 from sb3_tbc.zoo.ledger import to_json
+
+if TYPE_CHECKING:
+    Commands = argparse._SubParsersAction[Parser]
 
 EXAMPLES = {
     "sb3_tbc.benchmark train Pendulum": "training speed beside SB3's SAC, and where the time goes",
@@ -39,7 +42,7 @@ def build_parser() -> Parser:
     return parser
 
 
-def _add_cells(commands: Any) -> None:
+def _add_cells(commands: Commands) -> None:
     cells = commands.add_parser("cells", help="NDBCNet beside LTC, CfC and GRU: sequences, single steps, growth")
     cells.add_argument("--rounds", type=positive_int, default=20, help="rounds over all cells")
     cells.add_argument("--batch", type=positive_int, default=256, help="sequences in a batch")
@@ -49,29 +52,31 @@ def _add_cells(commands: Any) -> None:
     cells.add_argument("--json", metavar="OUT", help=JSON_HELP)
 
 
-def _add_fit(commands: Any) -> None:
+def _add_fit(commands: Commands) -> None:
     fit = commands.add_parser("fit", help="how fast and how well actors learn recorded skills and delays by imitation")
     fit.add_argument("--tasks", nargs="+", metavar="SKILL", help="tasks that have a recording, and delay3, delay10, "
                      "delay30 or another delay; by default all of these")  # fmt: skip
     fit.add_argument("--actors", nargs="+", metavar="ACTOR", default=["paper", "lean", "lean,reflex", "mlp"],
                      help="paper: table A1's circuit; lean: the same with lean synapses; either with options after "
                      "commas: reflex, full (fans), slow (command neurons), gains (of 6 to 12), inter=48, sub_steps=6, "
-                     "...; mlp: an MLP of as many parameters as table A1's circuit, mlp:64x64x64 of these widths, "
-                     "mlp:1300 of so many parameters; gru:16; a rate of its own as lean,rate=3e-2. By default paper, "
-                     "lean, lean,reflex and mlp")  # fmt: skip
+                     "...; mlp: an MLP of as many parameters as table A1's circuit, mlp:64x64x64: these widths, "
+                     "mlp:1300: about 1300 parameters; gru:16: a GRU of 16 units; add a single learning rate as in "
+                     "lean,rate=3e-2. By default paper, lean, lean,reflex and mlp")  # fmt: skip
     fit.add_argument("--steps", nargs="+", type=positive_int, default=[500, 1000, 2000, 8000], metavar="N",
-                     help="Adam steps after which to judge; by default 500, 1000, 2000 and 8000")  # fmt: skip
-    fit.add_argument("--seeds", type=positive_int, default=1, help="networks of each actor; figures are their mean")
+                     help="Adam steps after which to measure the fit; by default 500, 1000, 2000 and 8000")  # fmt: skip
+    fit.add_argument(
+        "--seeds", type=positive_int, default=1, help="number of seeds per actor; figures are means over them"
+    )
     fit.add_argument("--json", metavar="OUT", help=JSON_HELP)
     record = commands.add_parser("record", help="record the low level of a trained agent as a skill for fit")
     record.add_argument("model", metavar="MODEL.zip", help="an agent whose low level is an MLP (hits, or no-ndbc)")
     record.add_argument("--out", metavar="OUT.npz", help="by default the task's file among the package's skills")
-    record.add_argument("--every", type=positive_int, default=3, help="take every so many steps")
+    record.add_argument("--every", type=positive_int, default=3, help="record every N-th step", metavar="N")
     record.add_argument("--json", metavar="OUT", help=JSON_HELP)
     add_trust(record)
 
 
-def _add_robustness(commands: Any) -> None:
+def _add_robustness(commands: Commands) -> None:
     robustness = commands.add_parser("robustness", help="agents under noise, late actions and changed physics")
     robustness.add_argument("models", nargs="+", type=model_path, metavar="MODEL.zip", help="agents of one task, shown "
                             "side by side; pretrained:TASK is one that comes with the package")  # fmt: skip
@@ -81,7 +86,7 @@ def _add_robustness(commands: Any) -> None:
     add_trust(robustness)
 
 
-def _add_train(commands: Any) -> None:
+def _add_train(commands: Commands) -> None:
     train = commands.add_parser("train", help="training speed beside SB3's SAC and SBX's, and where the time goes")
     train.add_argument("tasks", nargs="*", default=["Pendulum", "Drawbridge"], metavar="TASK",
                        help="tasks to measure; by default Pendulum and Drawbridge")  # fmt: skip
@@ -90,10 +95,10 @@ def _add_train(commands: Any) -> None:
                        "split and update")  # fmt: skip
     train.add_argument("--config", choices=CONFIGS, help="values of the task's settings; by default tuned, for tasks "
                        "that have them")  # fmt: skip
-    train.add_argument("--n-envs", type=positive_int, help="environments side by side in split; by default the "
+    train.add_argument("--n-envs", type=positive_int, help="parallel environments in split; by default the "
                        "configuration's")  # fmt: skip
-    train.add_argument("--steps", type=positive_int, default=2000, help="environment steps of a stretch of learning")
-    train.add_argument("--rounds", type=positive_int, default=5, help="stretches of each contender, in turns")
+    train.add_argument("--steps", type=positive_int, default=2000, help="environment steps of one measurement")
+    train.add_argument("--rounds", type=positive_int, default=5, help="measurements of each contender, in turns")
     train.add_argument("--json", metavar="OUT", help=JSON_HELP)
 
 

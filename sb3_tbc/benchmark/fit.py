@@ -1,8 +1,8 @@
 """``python -m sb3_tbc.benchmark fit``: how fast and how well small actors learn skills by imitation.
 
-An hour of training says less about an actor than a minute of this: each actor learns each skill with Adam, batches of
-256 rows (32 sequences for delays), at every rate of a grid; R2 on rows of later episodes is reported at the best rate.
-As in training, it is the averaged actor that is judged.
+Imitation shows in a minute what an actor can represent. Each actor learns each skill with Adam, in batches of 256 rows
+(32 sequences for delays), at every learning rate of a grid. R2 on rows of later episodes is reported at the best rate.
+As in training, the averaged actor is evaluated.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import copy
 import itertools
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch as th
 from torch import nn
@@ -41,7 +41,7 @@ class Actor(NamedTuple):
 
 
 class Result(NamedTuple):
-    """How well an actor has learnt a skill."""
+    """Quality of an actor's fit to a skill."""
 
     skill: str
     actor: str
@@ -51,7 +51,7 @@ class Result(NamedTuple):
 
 
 class Plain(nn.Module):
-    """A network without a state behind the interface of circuits; a GRU is unrolled over the sequence."""
+    """A network without a state, with the interface of a circuit; a GRU is unrolled over the sequence."""
 
     def __init__(self, network: nn.Module, readout: nn.Module | None = None) -> None:
         super().__init__()
@@ -73,9 +73,9 @@ def parse_actor(text: str) -> Actor:
     ``full``, every fan as large as it can be; ``slow``, command neurons with time constants of 0.5 to 3 control steps;
     ``gains``, initial gains of 6 to 12; any number of the wiring or option of the network as ``inter=48``; and
     ``rate=3e-2``. ``mlp`` is an MLP of two hidden layers with as many parameters as table A1's circuit, ``mlp:24x14``
-    one of these widths, ``mlp:1300`` one of so many parameters, and ``gru:16`` a GRU.
+    one with these widths, ``mlp:1300`` one with about 1300 parameters, and ``gru:16`` a GRU with 16 units.
 
-    :raises ConfigError: if nothing is described by it
+    :raises ConfigError: if the description is wrong
     """
     kind, *options = text.split(",")
     name, _, size = kind.partition(":")
@@ -91,9 +91,9 @@ def parse_actor(text: str) -> Actor:
     raise ConfigError(f"no actor {text!r}: give paper or lean, mlp, mlp:24x14, mlp:1300 or gru:16, see --help")
 
 
-def _circuit_option(option: str, text: str) -> tuple[str, Any]:
+def _circuit_option(option: str, text: str) -> tuple[str, object]:
     key, _, value = option.partition("=")
-    switches: dict[str, tuple[str, Any]] = {
+    switches: dict[str, tuple[str, object]] = {
         "reflex": ("sensory_to", ("inter", "command", "motor")),
         "full": ("full", True),
         "slow": ("time_constants", {"command": (0.5, 3.0)}),
@@ -137,7 +137,7 @@ def make_mlp(skill: Skill, seed: int, widths: Sequence[int]) -> nn.Module:
 
 
 def equal_widths(skill: Skill, parameters: int) -> tuple[int, int]:
-    """Two hidden widths whose MLP has nearly so many parameters, neither more than twice the other."""
+    """Two hidden widths that give an MLP about this many parameters, neither more than twice the other."""
 
     def size(a: int, b: int) -> int:
         return (skill.n_inputs + 1) * a + (a + 1) * b + (b + 1) * skill.n_outputs
@@ -166,7 +166,7 @@ def judge(network: nn.Module, skill: Skill) -> float:
 
 
 def learn(network: nn.Module, skill: Skill, rate: float, steps: Sequence[int], seed: int = 0) -> dict[int, float]:
-    """R2 of the averaged network after so many Adam steps at a constant rate."""
+    """R2 of the averaged network after each of the given numbers of Adam steps, at a constant rate."""
     average = copy.deepcopy(network)
     optimizer = th.optim.Adam(network.parameters(), lr=rate)
     generator = th.Generator().manual_seed(seed)
@@ -198,7 +198,7 @@ def best_of(actor: Actor, skill: Skill, steps: Sequence[int], seeds: Sequence[in
     return Result(skill.name, actor.name, parameters, {step: found[rates[step]][step] for step in steps}, rates)
 
 
-def fit(arguments: argparse.Namespace) -> tuple[list[str], dict[str, Any]]:
+def fit(arguments: argparse.Namespace) -> tuple[list[str], dict[str, object]]:
     """Lines to print, and the figures of all actors on all skills."""
     th.set_num_threads(1)
     steps = sorted(arguments.steps)

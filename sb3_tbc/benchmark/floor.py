@@ -1,4 +1,4 @@
-"""What a training step cannot do without: the environment's own step, and the matrix products of the updates."""
+"""The smallest possible time of a training step: the environment's own step and the matrix products of the updates."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.level.level import SACLevel
 
 Shape = tuple[int, int, int, int]
-"""Of a product: how many at once, rows, length of the sums, columns."""
+"""Shape of a product: batch size, rows, length of the sums, columns."""
 
 LARGE = 1024
-"""Side of the matrices whose product tells the machine's best rate."""
+"""Size of the square matrices whose product measures the machine's highest rate."""
 
 
 class ProductCounter(TorchDispatchMode):
@@ -55,7 +55,7 @@ def products(level: SACLevel, batch_size: int, rounds: int) -> Products:
 
 
 def gemm_rate(rounds: int) -> float:
-    """The machine's best: floating-point operations per second of a large product, one thread."""
+    """The machine's highest rate: floating-point operations per second of a large product, one thread."""
     return 2.0 * LARGE**3 / _time_product((1, LARGE, LARGE, LARGE), rounds, repeats=3)
 
 
@@ -66,7 +66,7 @@ def _time_product(shape: Shape, rounds: int, repeats: int = 100) -> float:
     out = th.empty(at_once, rows, columns)
     if at_once == 1:
         left, right, out = left[0], right[0], out[0]
-    multiply: Callable[..., Any] = th.mm if at_once == 1 else th.bmm
+    multiply: Callable[..., th.Tensor] = th.mm if at_once == 1 else th.bmm
     best = math.inf
     with th.inference_mode():
         for _ in range(rounds):

@@ -1,4 +1,4 @@
-"""Where the time of a training step goes: a stopwatch over the functions that a step runs through."""
+"""Times of the parts of a training step: a stopwatch around the functions that a step calls."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import Any
+from typing import ParamSpec, TypeVar
 
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -20,11 +20,14 @@ PARTS = ("environment", "wrappers", "acting", "bookkeeping", "storing", "batches
 recording and the loop; relabelling and storing finished episodes; drawing batches with hindsight; the updates."""
 
 OUTSIDE = ("wrappers", "acting", "bookkeeping", "storing")
-"""What is neither an update nor the environment's own step."""
+"""Parts that are neither updates, nor drawing batches, nor the environment's own step."""
+
+P = ParamSpec("P")
+Result = TypeVar("Result")
 
 
 class Stopwatch:
-    """Time spent in each of several parts, without what they call of other parts."""
+    """Time spent in each of several parts, without the time of other parts that they call."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -33,7 +36,7 @@ class Stopwatch:
         self._since = 0.0
 
     def enter(self, part: str) -> None:
-        """The clock runs for this part from now on."""
+        """Charge time to this part from now on."""
         now = time.perf_counter()
         if self._open:
             self._charge(now)
@@ -42,7 +45,7 @@ class Stopwatch:
         self._since = now
 
     def leave(self) -> None:
-        """The clock runs again for the part that was left for this one."""
+        """Charge time to the calling part again."""
         now = time.perf_counter()
         self._charge(now)
         self._open.pop()
@@ -52,10 +55,10 @@ class Stopwatch:
         part = self._open[-1]
         self.seconds[part] = self.seconds.get(part, 0.0) + now - self._since
 
-    def timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(self, part: str, function: Callable[P, Result]) -> Callable[P, Result]:
         """The function, charged to a part."""
 
-        def run(*args: Any, **kwargs: Any) -> Any:
+        def run(*args: P.args, **kwargs: P.kwargs) -> Result:
             self.enter(part)
             try:
                 return function(*args, **kwargs)
@@ -65,7 +68,7 @@ class Stopwatch:
         return run
 
     @contextmanager
-    def watching(self, owner: Any, name: str, part: str) -> Iterator[None]:
+    def watching(self, owner: object, name: str, part: str) -> Iterator[None]:
         """Charge calls of ``owner.name`` to a part, for a while."""
         own = vars(owner).get(name)
         setattr(owner, name, self.timed(part, getattr(owner, name)))
@@ -97,9 +100,9 @@ def watching_cost(rounds: int = 20_000) -> tuple[float, float]:
 def profile(model: TBCHRL, steps: int) -> dict[str, float]:
     """Learn for some steps; microseconds per environment step in each of :data:`PARTS`, CPU time.
 
-    The CPU's clock takes two microseconds to read, so that the parts are taken by the wall clock, whose reading costs a
-    seventh of that, and multiplied by the share of the whole stretch that this process was on the CPU. What watching
-    itself adds, a microsecond for each of about ten calls of a step, is measured and taken off.
+    Reading the CPU clock takes two microseconds, so parts are measured with the wall clock, which takes a seventh of
+    that. The results are multiplied by the share of the time in which this process was on the CPU. The cost of the
+    measurement itself, about a microsecond for each of ten calls per step, is measured and subtracted.
 
     :param steps: environment steps, in whole episodes if the parts are to add up
     """
@@ -119,12 +122,12 @@ def profile(model: TBCHRL, steps: int) -> dict[str, float]:
     return {part: 1e6 * max(seconds[part], 0.0) / done for part in PARTS}
 
 
-def _watched(model: TBCHRL) -> list[tuple[Any, str, str]]:
-    """Who is watched, and what for. Nested calls are charged to the innermost."""
+def _watched(model: TBCHRL) -> list[tuple[object, str, str]]:
+    """The functions to measure, with their parts. Nested calls are charged to the innermost part."""
     venv = model.env
     if not isinstance(venv, VecEnv):
-        raise ValueError("the model has no environment to be profiled in")
-    watched: list[tuple[Any, str, str]] = [
+        raise ValueError("the model has no environment; profiling needs one")
+    watched: list[tuple[object, str, str]] = [
         (Collector, "act", "acting"),
         (Collector, "propose", "acting"),
         (Collector, "step", "bookkeeping"),

@@ -1,4 +1,4 @@
-"""``python -m sb3_tbc.benchmark robustness``: what agents still do with noise, late actions and other physics.
+"""``python -m sb3_tbc.benchmark robustness``: success of agents under noise, late actions and changed physics.
 
 Each agent acts in the same disturbed episodes of its task. The disturbances are those of
 :class:`~sb3_tbc.tasks.perturb.Perturb`: noise on observations, actions that take effect late, and each physical
@@ -30,7 +30,7 @@ NOISES = (0.01, 0.03, 0.1)
 DELAYS = (1, 2, 4)
 """Steps by which actions are late."""
 FACTORS = (0.7, 1.3)
-"""Of each physical quantity."""
+"""Factors for each physical quantity."""
 
 
 class Robustness(NamedTuple):

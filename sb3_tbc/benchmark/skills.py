@@ -28,12 +28,12 @@ DELAY_STEPS = 50
 
 
 class Skill(NamedTuple):
-    """What an actor has to learn: inputs and standardised targets, ``(rows, n)`` or ``(sequences, time, n)``."""
+    """A skill to learn: inputs and standardised targets, ``(rows, n)`` or ``(sequences, time, n)``."""
 
     name: str
     inputs: th.Tensor
     targets: th.Tensor
-    later_inputs: th.Tensor  # what it is judged on: rows of later episodes, or sequences of their own
+    later_inputs: th.Tensor  # for evaluation: rows of later episodes, or other sequences
     later_targets: th.Tensor
 
     @property
@@ -73,13 +73,13 @@ def load_skill(name: str) -> Skill:
 
 
 def delay_skill(steps: int, n_learnt: int = 2048, n_later: int = 256) -> Skill:
-    """Say what was heard so many control steps ago: uniform numbers in [-1, 1], each held for five steps.
+    """Repeat the input of ``steps`` control steps ago: uniform numbers in [-1, 1], each held for five steps.
 
-    The first ``steps`` targets of a sequence are zero. Without memory a third of the variance is all there is.
+    The first ``steps`` targets of a sequence are zero. Without memory an actor explains at most a third of it.
 
     :param steps: the delay
     :param n_learnt: sequences to learn from
-    :param n_later: sequences to be judged on
+    :param n_later: sequences for evaluation
     """
     rng = np.random.default_rng(steps)
     held = rng.uniform(-1.0, 1.0, (n_learnt + n_later, DELAY_STEPS // 5)).repeat(5, axis=1)
@@ -89,19 +89,21 @@ def delay_skill(steps: int, n_learnt: int = 2048, n_later: int = 256) -> Skill:
 
 
 def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[str, FloatArray]:
-    """What the low level of an agent sees while both levels act with noise, and the means it answers with.
+    """Record the inputs of an agent's low level while both levels act with noise, and the means of its actions.
 
     :param model: a trained agent whose low level is an MLP: it has no memory, so its rows are independent
     :param env: one environment of the agent's task
-    :param every: take every so many steps; neighbouring ones are much alike
-    :param seed: of environment and noise
+    :param every: record every n-th step, because neighbouring steps are very similar
+    :param seed: seed of environment and noise
     :return: ``inputs`` divided by the circuit's fixed scales and ``means`` before squashing, float16, and ``learnt``,
         the number of rows to learn from: those of the first 85 % of the episodes
     :raises ConfigError: if the low level is a circuit
     """
     actor = model.low.policy.average_actor
     if actor.state_dim:
-        raise ConfigError("the low level of this agent is a circuit, whose answers depend on its memory: record an MLP")
+        raise ConfigError(
+            "the low level of this agent is a circuit, whose actions depend on its memory; record an agent with an MLP"
+        )
     runner = TwoLevelRunner(env, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule)
     env.seed(seed)
     runner.reset()
@@ -118,24 +120,24 @@ def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[st
     scaled = seen / np.asarray(model.views.low_scale(), dtype=np.float32)
     learnt = max([end for end in ends if end <= 0.85 * n_rows], default=0)
     if not learnt:
-        raise ConfigError(f"no episode ended within {n_rows * every} steps: nothing to tell early from later ones by")
+        raise ConfigError(f"no episode ended within {n_rows * every} steps: there are no later episodes for evaluation")
     half = {"inputs": scaled.astype(np.float16), "means": means.astype(np.float16)}
     return {**half, "learnt": np.array(learnt)}
 
 
 def record_file(path: Path, out: Path | None, every: int, trust: bool = False) -> Path:
-    """Record the agent in a ``.zip`` on the task it was trained on.
+    """Record the agent in a ``.zip`` on the task on which it was trained.
 
     :param path: the agent
     :param out: where to write; by default where the skills of this package lie, under the task's name
     :param every: see :func:`record`
     :param trust: whether the file may run code
     :return: the file written
-    :raises ConfigError: if the agent does not say what it was trained on
+    :raises ConfigError: if the agent's file does not name its task
     """
     info = read_zip(path).get(RUN_INFO)
     if info is None:
-        raise ConfigError(f"{path} does not say which environment it was trained on; train with sb3_tbc.train")
+        raise ConfigError(f"{path} does not say on which environment it was trained; train with sb3_tbc.train")
     env = make_envs(info["env_id"], 1, 0, info["env_kwargs"])
     recording = record(load_two_levels(path, trust=trust), env, every)
     env.close()

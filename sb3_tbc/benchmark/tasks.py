@@ -20,6 +20,7 @@ import gymnasium as gym
 import numpy as np
 
 from sb3_tbc.aliases import Env
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.tasks import TASKS, register_tasks
 
 PUBLIC = {
@@ -33,7 +34,7 @@ PUBLIC = {
 """Steps per second of the public implementations (martius-lab/HiTS, martius-lab/dynamic-rl-benchmarks), measured beside
 ours with the same engines (MuJoCo 4.0.0, Box2D 2.3.10), no wrappers; one core of an AMD EPYC (2 cores, shared)."""
 
-Actions = np.ndarray[Any, Any]
+Actions = AnyArray
 
 
 def steps_per_second(env: Any, actions: Actions, seed: int | None = 0) -> float:

@@ -1,4 +1,4 @@
-"""What ``python -m sb3_tbc.benchmark train`` measures: training speed beside SB3's and SBX's SAC, and where it goes."""
+"""Measurements of ``python -m sb3_tbc.benchmark train``: training speed beside SAC of SB3 and SBX, and its parts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ BUDGET_MINUTES = {
 }
 """How long a full budget of table 1 may take on one core."""
 ROW_LIMIT = 50_000
-"""Rows written at once where buffers are filled up artificially."""
+"""Rows written at once when buffers are filled artificially."""
 
 Figures = Plain
 Result = tuple[list[str], Figures]
@@ -53,7 +53,7 @@ class Contender(NamedTuple):
     """Something that learns: ``learn(steps)`` goes on for that many environment steps, ``done()`` counts them."""
 
     name: str
-    learn: Callable[[int], Any]
+    learn: Callable[[int], object]
     done: Callable[[], int]
 
 
@@ -64,10 +64,10 @@ def one_core() -> None:
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
-def ours(task: str, n_envs: int | None = 1, config: str | None = None, **settings: Any) -> TBCHRL:
-    """TBC-HRL as it is shipped for a task, compiled from the first update on where that is possible.
+def ours(task: str, n_envs: int | None = 1, config: str | None = None, **settings: object) -> TBCHRL:
+    """TBC-HRL with the shipped settings of a task, compiled from the first update on if possible.
 
-    :param n_envs: environments side by side; None for the configuration's number
+    :param n_envs: parallel environments; None for the configuration's number
     """
     task, env_id = resolve_env(task)
     run = load_config("tbc-hrl", task, config)
@@ -80,10 +80,10 @@ def ours(task: str, n_envs: int | None = 1, config: str | None = None, **setting
 
 
 def contenders(task: str, config: str | None = None) -> list[Contender]:
-    """TBC-HRL, SB3's SAC and, where it is installed, SBX's, on the same task.
+    """TBC-HRL, SB3's SAC and, if installed, SBX's SAC, on the same task.
 
-    The flat agents get the low level's network sizes and batch, one update where TBC-HRL does one on each level, and
-    the task's observation as one flat vector, which is what they are fastest on.
+    The flat agents get the low level's network sizes and batch size, one update for each pair of updates of TBC-HRL's
+    levels, and the observation as one flat vector, with which they are fastest.
     """
     model = ours(task, config=config)
     warm_up(model, 1000)
@@ -118,7 +118,7 @@ def _flat(name: str, kind: Any, env: Env, model: TBCHRL) -> Contender:
 
 
 def warm_up(model: TBCHRL, steps: int) -> None:
-    """Learn until both levels do: a level begins to update after an episode, when its buffer holds a batch."""
+    """Train until both levels update: a level begins after an episode, when its buffer holds a batch."""
     model.learn(max(steps, 1000), reset_num_timesteps=False)
     while not (model.high._n_updates and model.low._n_updates):
         model.learn(steps, reset_num_timesteps=False)
@@ -255,7 +255,7 @@ def _level_env(model: TBCHRL) -> Env:
 
 
 def fill(model: TBCHRL, steps: int) -> None:
-    """Fill both replay buffers as far as so many environment steps would, by repeating what they hold.
+    """Fill both replay buffers as after this many environment steps, by repeating their content.
 
     :raises ValueError: if there is nothing to repeat
     """

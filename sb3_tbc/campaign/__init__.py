@@ -1,1 +1,1 @@
-"""Many runs: which are to do, how long they take, and carrying them out here, on Slurm or on a Ray cluster."""
+"""Campaigns of many runs: what is to do, how long it takes, and execution here, on Slurm or on a Ray cluster."""

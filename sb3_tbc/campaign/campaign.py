@@ -1,4 +1,4 @@
-"""Carrying out a list of runs: so many at a time, each kept in the ledger when it ends."""
+"""Carries out a list of runs, several at a time; each result is copied into the ledger."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from sb3_tbc.commands import INTERRUPTED
 PAUSE = 0.2
 """Seconds between two looks at the running jobs."""
 PATIENCE = 120.0
-"""Seconds that stopped runs get to save themselves."""
+"""Seconds that stopped runs may take to save a checkpoint."""
 
 
 class Campaign:
-    """Carries out jobs; stopping it stops the runs, which save themselves.
+    """Carries out jobs; stopping it stops the runs, which save checkpoints.
 
     :param executor: where they are carried out
     :param workers: how many at a time
@@ -70,7 +70,7 @@ class Campaign:
             self.board.fail(job, status, job.keep_failure(status))
 
     def _stop(self) -> None:
-        """Ask all runs to end, once each, and wait until they have saved themselves."""
+        """Ask each run once to stop, and wait until all have saved a checkpoint."""
         for handle in self.running.values():
             handle.stop()
         until = time.monotonic() + PATIENCE

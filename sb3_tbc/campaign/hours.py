@@ -29,7 +29,7 @@ def measured_speeds(ledger: Path) -> Speeds:
 
 
 def hours_of(job: Job, speeds: Speeds) -> float | None:
-    """Hours that a run takes; ``None`` where the ledger has no run of its task."""
+    """Hours that a run takes; ``None`` if the ledger has no run of its task."""
     task, _ = resolve_env(job.env)
     speed = speeds.get((task, job.algo)) or speeds.get((task, ""))
     return job.n_timesteps / speed / 3600 if speed else None

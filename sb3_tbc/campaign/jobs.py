@@ -1,4 +1,4 @@
-"""One run of a campaign: its folders, its command, and what is kept of it when it fails."""
+"""One run of a campaign: its folders, its command, and the record of a failure."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from sb3_tbc.files import write_atomic
 from sb3_tbc.zoo.ledger import RunFolder, to_json
 
 FAILED = "failed.json"
-"""In the ledger's folder of a run that ended in an error: when it was tried, how often, and what it said last."""
+"""File in the ledger's folder of a failed run: exit status, number of attempts and last message."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of the campaign and the folders it goes to.
+    """One run of the campaign and its folders.
 
     :param algo: algorithm
     :param env: task or environment id, as it was asked for

@@ -1,4 +1,4 @@
-"""What a person sees of a campaign: a line when a run begins and ends, and on a terminal a bar for each."""
+"""Progress of a campaign: a line when a run begins or ends, and on a terminal a bar for each run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trained agents that come with the package, each with its model card; ``make pretrained`` makes them anew."""
+"""Trained agents that come with the package, each with its model card; ``make pretrained`` trains them again."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def load_pretrained(name: str, env: Any = None, device: str = "cpu") -> Agent:
     """A trained agent.
 
     :param name: a task's short name, e.g. ``"Pendulum"``
-    :param env: environments to act in, if the agent is to go on learning
+    :param env: environments to act in, for further training
     :param device: torch device
     :raises ConfigError: if there is none, naming the nearest one
     """

@@ -1,4 +1,4 @@
-"""Which of the paper's claims hold in the runs of the ledger, each with its comparison."""
+"""Checks the paper's claims against the runs of the ledger, each with its comparison."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HOLDS, SAME, OPPOSITE = "holds", "no difference shown", "the opposite"
 
 
 class Claim(NamedTuple):
-    """A claim on one task: the verdict and what it rests on."""
+    """A claim on one task, with its verdict and evidence."""
 
     text: str
     task: str
@@ -28,7 +28,7 @@ class Claim(NamedTuple):
 
 
 def verdict(difference: float, test: stats.Comparison) -> str:
-    """What a comparison says: a direction only where the corrected test is below 0.05."""
+    """Verdict of a comparison: a direction only if the corrected p-value is below 0.05."""
     if test.p_holm is None or test.p_holm >= 0.05:
         return SAME if not test.note else f"{SAME} ({test.note})"
     return HOLDS if difference > 0 else OPPOSITE

@@ -1,4 +1,4 @@
-"""Ours against every baseline and against its own ablations: tests, intervals, environment steps saved."""
+"""Comparisons of TBC-HRL with every baseline and with its own ablations: tests, intervals, environment steps saved."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from sb3_tbc.report.runs import OURS, Results, Run, is_shipped, on_union_of_step
 from sb3_tbc.zoo.config import ABLATIONS
 
 BLOCK = 10
-"""Episodes in a block of the paired bootstrap: those that are evaluated side by side."""
+"""Episodes in a block of the paired bootstrap: the number of episodes that are evaluated in parallel."""
 CONVERGED = 0.5
-"""Where no method comes this far, the paper reports no convergence gain (Tennis2D), and neither do we."""
+"""If no method reaches this success, the paper reports no convergence gain (Tennis2D), and neither do we."""
 
 
 class Gain(NamedTuple):
-    """Environment steps until the mean curve first reaches a threshold; ``None`` where it never does."""
+    """Environment steps until the mean curve first reaches a threshold; ``None`` if it never does."""
 
     threshold: float
     ours: int | None
@@ -27,7 +27,7 @@ class Gain(NamedTuple):
 
     @property
     def ahead(self) -> bool:
-        """Whether ours is there first."""
+        """Whether ours reaches the threshold first."""
         return self.ours is not None and (self.theirs is None or self.ours < self.theirs)
 
     def __str__(self) -> str:
@@ -50,7 +50,7 @@ class Row(NamedTuple):
 
 
 def interval_of(runs: Sequence[Run]) -> stats.Interval:
-    """Mean final success over seeds and its interval, never of width zero where the episodes are known."""
+    """Mean final success over seeds and its interval, which is never of width zero if the episodes are known."""
     episodes = [run.episodes for run in runs]
     if not all(episodes):
         return stats.bootstrap_mean(successes(runs))
@@ -60,8 +60,8 @@ def interval_of(runs: Sequence[Run]) -> stats.Interval:
 def difference_of(first: Sequence[Run], second: Sequence[Run]) -> stats.Interval:
     """Difference of the mean success and its interval.
 
-    With fewer than three seeds on a side the episodes are resampled in pairs where both sides recorded them on the same
-    evaluation seeds (paper, section 5.1); the interval is never narrower than the one combined from both sides.
+    With fewer than three seeds on a side, episodes are resampled in pairs if both sides recorded them on the same
+    evaluation seeds (paper, section 5.1). The interval is never narrower than the one combined from both sides.
     """
     combined = stats.difference(interval_of(first), interval_of(second))
     if min(len(first), len(second)) >= stats.FEWEST_SEEDS:
@@ -85,9 +85,9 @@ def mean_curve(runs: Sequence[Run]) -> tuple[list[int], list[float]] | None:
 
 
 def common_threshold(methods: Mapping[str, Sequence[Run]]) -> float | None:
-    """0.9 of the best mean success that any method with shipped settings reaches on the way.
+    """0.9 of the best mean success that any method with shipped settings reaches in an evaluation.
 
-    The best method sets it, so one that never learns cannot meet it. ``None`` where none reaches :data:`CONVERGED`.
+    The best method sets it, so a method that never learns cannot reach it. ``None`` if none reaches :data:`CONVERGED`.
     """
     curves = [curve for runs in shipped(methods).values() if (curve := mean_curve(runs))]
     best = max((max(rates) for _, rates in curves if rates), default=0.0)
@@ -95,7 +95,7 @@ def common_threshold(methods: Mapping[str, Sequence[Run]]) -> float | None:
 
 
 def convergence_gain(ours: Sequence[Run], theirs: Sequence[Run], threshold: float | None) -> Gain | None:
-    """Environment steps that ours saves on the way to a threshold; ``None`` without curves or threshold."""
+    """Environment steps that ours needs less to reach a threshold; ``None`` without curves or threshold."""
     curves = mean_curve(ours), mean_curve(theirs)
     if threshold is None or curves[0] is None or curves[1] is None:
         return None
@@ -109,9 +109,9 @@ def baselines(methods: Mapping[str, Sequence[Run]]) -> list[str]:
 
 
 def strongest_baselines(methods: Mapping[str, Sequence[Run]]) -> list[str]:
-    """The baseline with the best mean success; of equals, the one that is first at the common threshold.
+    """The baseline with the best mean success; among equals, the one that reaches the common threshold first.
 
-    :return: more than one where they are equal in both, none without a baseline
+    :return: several if they are equal in both, none without a baseline
     """
     threshold = common_threshold(methods)
 

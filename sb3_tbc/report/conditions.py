@@ -1,17 +1,16 @@
-"""What must be the same for all methods of a task, and which rows differ in it."""
+"""Conditions that should be the same for all methods of a task, and the rows that differ."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 from sb3_tbc.report.runs import OURS, Results, Run, shipped
 
 TWO_LEVELS = ("tbc-hrl", "hits", "hac")
 
 
-def _level(run: Run, level: str, key: str) -> Any:
-    """A setting of a level, or of the agent itself where it has one level."""
+def _level(run: Run, level: str, key: str) -> object:
+    """A setting of a level, or of the agent itself if it has only one level."""
     model = run.config.get("model") or {}
     return (model.get(level) or model).get(key)
 
@@ -27,7 +26,7 @@ def _subgoal_view(run: Run) -> str | None:
     return "relative" if (run.config.get("model") or {}).get("relative_subgoals") else "absolute"
 
 
-CONDITIONS: dict[str, Callable[[Run], Any]] = {
+CONDITIONS: dict[str, Callable[[Run], object]] = {
     "observation": lambda run: (run.config.get("env_kwargs") or {}).get("observation", "paper"),
     "subgoals seen": _subgoal_view,
     "training steps": lambda run: run.config.get("n_timesteps", run.final.get("n_timesteps")),
@@ -39,10 +38,10 @@ CONDITIONS: dict[str, Callable[[Run], Any]] = {
     "episodes per evaluation": lambda run: run.config.get("n_eval_episodes"),
     "final episodes": lambda run: run.config.get("n_final_episodes", run.final.get("n_episodes")),
 }
-"""Name of a condition -> its value for a run; ``None`` where it does not apply."""
+"""Name of a condition -> its value for a run; ``None`` if it does not apply."""
 
 
-def condition_values(runs: Sequence[Run]) -> dict[str, list[Any]]:
+def condition_values(runs: Sequence[Run]) -> dict[str, list[object]]:
     """Values of each condition over the seeds of a row, each once, in order of appearance."""
     return {
         name: list(dict.fromkeys(v for run in runs if run.config and (v := value(run)) is not None))
@@ -51,7 +50,7 @@ def condition_values(runs: Sequence[Run]) -> dict[str, list[Any]]:
 
 
 def differences(runs: Sequence[Run], reference: Sequence[Run]) -> list[str]:
-    """In what a row differs from another one, and in what its own seeds differ: ``name: value (other value)``."""
+    """Conditions in which a row differs from another, or its seeds from each other: ``name: value (other value)``."""
     found = []
     other = condition_values(reference)
     for name, values in condition_values(runs).items():
@@ -62,12 +61,12 @@ def differences(runs: Sequence[Run], reference: Sequence[Run]) -> list[str]:
     return found
 
 
-def _said(value: Any) -> str:
+def _said(value: object) -> str:
     return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
 
 
 def unequal_conditions(results: Results) -> dict[str, dict[str, list[str]]]:
-    """Task -> baseline -> in what it differs from our row, which is the reference; equal rows are left out."""
+    """Task -> baseline -> conditions in which it differs from our row; equal rows are left out."""
     found: dict[str, dict[str, list[str]]] = {}
     for task, methods in results.items():
         rows = shipped(methods)
@@ -79,10 +78,10 @@ def unequal_conditions(results: Results) -> dict[str, dict[str, list[str]]]:
 
 
 def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]]) -> list[str]:
-    """What a reader of a single row must know: unequal conditions, and code that differs from its commit.
+    """Notes on a single row: unequal conditions, and code that differs from its commit.
 
-    :param runs: the row
-    :param reference: the task's rows, of which ours is compared with
+    :param runs: runs of the row
+    :param reference: all rows of the task; ours is the one to compare with
     """
     notes = differences(runs, reference[OURS]) if OURS in reference else []
     if any(run.tuned_on for run in runs):

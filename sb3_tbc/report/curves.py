@@ -1,6 +1,6 @@
 """Learning curves as inline SVG: every seed's measured points, the mean with its band, the paper's value as a line.
 
-Drawn without a library: nothing is resampled, the page works without scripts, and the same runs give the same bytes.
+Drawn without a library, so that nothing is resampled, the page works without scripts, and equal runs give equal files.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ DASHES = ("", "6 3", "2 2", "8 3 2 3", "10 4", "4 2 1 2", "1 3")
 
 
 class Style:
-    """How a method is drawn: no two methods of a figure share colour and dashes, and each has a label of its own.
+    """Colours, dashes and labels of a figure's methods; no two methods have the same combination.
 
     :param methods: the figure's methods in order
     """
@@ -44,9 +44,9 @@ def shipped_first(methods: Iterable[str]) -> list[str]:
 
 
 def figure(task: str, methods: Mapping[str, Sequence[Run]], paper: Paper) -> str:
-    """One task's curves; methods without an evaluation are left out, variants are there and hidden.
+    """One task's curves; methods without an evaluation are left out, variants are hidden at first.
 
-    :return: SVG text, or an empty text where no method has a curve
+    :return: SVG text, empty if no method has a curve
     """
     drawn = {method: [run for run in runs if run.rows] for method, runs in methods.items()}
     drawn = {method: runs for method, runs in drawn.items() if runs}
@@ -71,7 +71,7 @@ def figure(task: str, methods: Mapping[str, Sequence[Run]], paper: Paper) -> str
 
 
 def tick_distance(last: int) -> int:
-    """A round distance of steps with which an axis up to ``last`` gets four or five ticks above zero at most."""
+    """A round distance of ticks, so that an axis up to ``last`` has at most five ticks above zero."""
     power = int(10 ** max(len(str(last)) - 2, 0))
     return next(unit * power for unit in (1, 2, 5, 10, 25, 50, 100) if unit * power * 5 >= last)
 
@@ -140,7 +140,7 @@ def _points(pairs: Sequence[tuple[float, float]], x_max: int) -> str:
 
 
 def label_places(methods: Mapping[str, Sequence[Run]], x_max: int) -> dict[str, float]:
-    """Where the labels at the right border go: near the curves' ends, none over another, shipped ones first."""
+    """Places of the labels at the right border: near the ends of their curves, without overlap, shipped ones first."""
     free = list(np.arange(TOP, BOTTOM + LABEL / 2, LABEL))
     places = {}
     for method in shipped_first(methods):

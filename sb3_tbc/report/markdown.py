@@ -21,7 +21,7 @@ MARKS = ("<!-- results:begin -->", "<!-- results:end -->")
 def to_markdown(
     results: Results, descriptions: Mapping[str, Mapping[str, str]], paper: Paper, missing: tables.Table
 ) -> str:
-    """All tables, with what each row is and which planned runs are missing; empty tables are left out."""
+    """All tables, with descriptions of the rows and the planned runs that are missing; empty tables are left out."""
     sections = [
         ("Shipped settings beside the paper", tables.paper_table(results, paper), f"Paper: {paper.source}."),
         ("Against every baseline", tables.comparison_table(against_baselines(results)), tables.COMPARISON_NOTES),
@@ -49,7 +49,7 @@ def _said(note: str) -> str:
 
 
 def update_page(path: Path, text: str) -> None:
-    """Replace what stands between the result marks of a Markdown page.
+    """Replace the text between the result marks of a Markdown page.
 
     :raises ConfigError: if the page or its marks are missing
     """

@@ -1,4 +1,4 @@
-"""The minutes that ``train --list`` names, taken from the ledger."""
+"""The minutes that ``train --list`` prints, computed from the ledger."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page: one HTML file that needs nothing else, readable without scripts, on a phone, in light and dark."""
+"""The report as one HTML file without external resources, readable without scripts, on a phone, in light and dark."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sb3_tbc.report.timeline import TRACE, last_episode, option_timeline
 TEXT_COLUMNS = ("what it is", "notes", "note", "differs from ours in", "evidence", "machine", "verdict", "command")
 INTRODUCTION = (
     "Rows without a further name have the shipped settings. Lines are means over seeds, bands their 95 % bootstrap "
-    "intervals, dots every measured evaluation. Point at a curve to read it, at a name to bring its line out."
+    "intervals, dots every measured evaluation. Point at a curve to read its values, at a name to highlight its curve."
 )
 
 
@@ -34,11 +34,11 @@ def to_html(
     """The whole page.
 
     :param results: finished runs
-    :param descriptions: what the rows are
+    :param descriptions: descriptions of the rows
     :param paper: the paper's figures
     :param failed: folders of runs that ended in an error
     :param missing: table of planned runs that the ledger lacks
-    :param out: where the page will lie, for links to films
+    :param out: path of the page, for links to films
     """
     style, script = (_template(name) for name in ("page.css", "page.js"))
     body = [
@@ -132,7 +132,7 @@ def _key(
     descriptions: Mapping[str, Mapping[str, str]],
     marks: Mapping[tuple[str, str], str],
 ) -> str:
-    """Names of the curves, each with a box that shows or hides it, and the mark of its test against ours."""
+    """The legend: for each curve a box that shows or hides it, its name, and the mark of its test against ours."""
     style = curves.Style(list(methods))
     parts = []
     for method in curves.shipped_first(methods):
@@ -210,7 +210,7 @@ def _row(
 
 
 def _films(results: Results, out: Path) -> list[str]:
-    """Films beside the page or in a run's folder, and the options of runs that were traced."""
+    """Films beside the page or in a run's folder, and the options of runs with a trace."""
     parts = []
     beside = sorted(out.absolute().parent.glob("*.mp4"))
     parts += [_film(path, out) for path in beside]

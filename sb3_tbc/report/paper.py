@@ -1,4 +1,4 @@
-"""The paper's figures, shipped with the package, to stand beside ours."""
+"""The paper's figures, shipped with the package, for comparison with ours."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Figure(NamedTuple):
 
 
 class Paper(NamedTuple):
-    """Tables 1 to 3 and the published HiTS policies, as ``paper.yml`` has them."""
+    """Tables 1 to 3 and the published HiTS policies, from ``paper.yml``."""
 
     source: str
     steps: Mapping[str, int]
@@ -25,7 +25,7 @@ class Paper(NamedTuple):
     public_hits: Mapping[str, float]
 
     def success(self, task: str, method: str) -> Figure | None:
-        """The paper's figure for a row of ours; ``None`` for rows that it does not have."""
+        """The paper's figure for one of our rows; ``None`` if the paper has none."""
         percent = self.figures.get(task, {}).get(method)
         return None if percent is None else Figure(percent[0] / 100, percent[1] / 100)
 

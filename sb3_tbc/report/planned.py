@@ -1,4 +1,4 @@
-"""The planned campaign: which of its runs are missing, and the command that makes them."""
+"""The planned campaign: its missing runs, and the commands that make them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CAMPAIGN = "campaign.yml"
 
 
 def missing_table(root: Path, results: Results) -> list[list[str]]:
-    """Planned rows that lack seeds: how many are there, and the command for the others; only a header without a plan.
+    """Planned rows with missing seeds: how many are finished, and the command for the others; without a plan a header.
 
     :raises ConfigError: if the plan cannot be read
     """

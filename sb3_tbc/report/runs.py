@@ -1,4 +1,4 @@
-"""Finished runs of a folder: what each says of itself, and what a row of the tables is called."""
+"""Finished runs of a folder, grouped into the rows of the tables."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import yaml
 
 from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.zoo.callbacks import EvaluationRow
 from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
@@ -21,9 +22,9 @@ OURS = "tbc-hrl"
 SHIPPED = "full"
 """Variant of runs with the shipped settings; runs of any other variant are never a baseline."""
 DESCRIPTIONS = "descriptions.yml"
-"""In the folder of results: task -> method -> one line; under ``default``: variant -> one line."""
+"""File in the folder of results: task -> method -> one line; under ``default``: variant -> one line."""
 TUNING_SEEDS = "tuning_seeds.yml"
-"""In the folder of results: task -> method -> seeds on which the row's settings were chosen."""
+"""File in the folder of results: task -> method -> seeds on which the row's settings were chosen."""
 
 
 class Curve(NamedTuple):
@@ -46,7 +47,7 @@ class Run(NamedTuple):
 
     @property
     def method(self) -> str:
-        """The algorithm, with the variant where it is not the shipped one."""
+        """The algorithm, with the variant if it is not the shipped one."""
         algo, variant = str(self.final["algo"]), str(self.final["variant"])
         return algo if variant == SHIPPED else f"{algo} {variant}"
 
@@ -62,23 +63,23 @@ class Run(NamedTuple):
 
     @property
     def episodes(self) -> int:
-        """Episodes of the final evaluation, 0 where the run does not say."""
+        """Episodes of the final evaluation, 0 if they were not recorded."""
         return int(self.final.get("n_episodes") or 0)
 
     @property
     def outcomes(self) -> list[int] | None:
-        """Success of each episode of the final evaluation in order, where the run recorded it."""
+        """Success of each episode of the final evaluation in order; ``None`` if it was not recorded."""
         text = self.final.get("outcomes")
         return [int(digit) for digit in text] if isinstance(text, str) and text else None
 
     @property
     def commit(self) -> str:
-        """Commit of the code, with ``+`` where files differed from it; ``unknown`` outside a checkout."""
+        """Commit of the code, with ``+`` if files had been changed; ``unknown`` outside a checkout."""
         return str(self.versions.get("commit") or "unknown")
 
     @property
     def dirty(self) -> bool:
-        """Whether the code cannot be told from the commit."""
+        """Whether the commit does not determine the code."""
         return self.commit.endswith("+") or self.commit == "unknown"
 
 
@@ -89,9 +90,9 @@ Results = dict[str, dict[str, list[Run]]]
 def load_results(root: Path) -> Results:
     """All finished runs below a folder.
 
-    Seeds on which settings were chosen are left out where their row has others: they would flatter it.
+    Seeds on which settings were chosen are left out if their row has other seeds, because they would bias it.
 
-    :raises ConfigError: if there is none or one cannot be read
+    :raises ConfigError: if there is no run, or one cannot be read
     """
     results: Results = defaultdict(lambda: defaultdict(list))
     for folder in finished_runs(root):
@@ -110,7 +111,7 @@ def load_results(root: Path) -> Results:
 
 
 def _reported(runs: Sequence[Run], tuned_on: Iterable[int]) -> list[Run]:
-    """Runs of a row in order of their seeds, those that settings were chosen on only where there are no others."""
+    """Runs of a row in order of their seeds; seeds on which settings were chosen only if there are no others."""
     chosen = set(tuned_on)
     marked = [run._replace(tuned_on=run.seed in chosen) for run in sorted(runs, key=lambda run: run.seed)]
     return [run for run in marked if not run.tuned_on] or marked
@@ -136,7 +137,7 @@ def _rank(method: str) -> tuple[bool, str]:
 
 
 def failed_runs(root: Path) -> list[Path]:
-    """Folders of runs that ended in an error, as ``reproduce`` marks them, and that have not been run again since."""
+    """Folders of runs that ended in an error, as ``reproduce`` marks them, and that have not been repeated since."""
     return [p.parent for p in sorted(root.glob("*/*/*/seed_*/failed.json")) if not (p.parent / "final.json").is_file()]
 
 
@@ -156,7 +157,7 @@ def successes(runs: Sequence[Run]) -> list[float]:
 
 
 def load_descriptions(root: Path) -> dict[str, dict[str, str]]:
-    """What the rows are, in a line each; none where the folder has no such file.
+    """Descriptions of the rows, one line each; empty if the folder has no such file.
 
     :raises ConfigError: if the file cannot be read
     """
@@ -164,7 +165,7 @@ def load_descriptions(root: Path) -> dict[str, dict[str, str]]:
 
 
 def _read_table(path: Path) -> dict[str, Plain]:
-    """A YAML file of two levels, empty where there is none.
+    """Read a YAML file of two levels; empty if there is no such file.
 
     :raises ConfigError: if it cannot be read
     """
@@ -178,17 +179,17 @@ def _read_table(path: Path) -> dict[str, Plain]:
 
 
 def describe(descriptions: Mapping[str, Mapping[str, str]], task: str, method: str) -> str:
-    """The line of a row: the task's own, else that of the method or the variant in general, else empty."""
+    """The description of a row: that of the task, else the general one of the method or variant, else empty."""
     general = descriptions.get("default", {})
     variant = method.partition(" ")[2]
     return descriptions.get(task, {}).get(method) or general.get(method) or general.get(variant) or ""
 
 
-def on_union_of_steps(curves: Sequence[Curve]) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Curves at all steps at which any of them was evaluated, between the last beginning and the first end.
+def on_union_of_steps(curves: Sequence[Curve]) -> tuple[FloatArray, FloatArray]:
+    """Curves at all steps at which any of them was evaluated, in the range that all of them cover.
 
-    Between its own points a curve is a straight line. Every measured value within the range is kept, so no extreme is
-    lost, whatever the steps of the seeds are.
+    A curve is interpolated linearly between its own points. All measured values in the range are kept, so no extreme is
+    lost, even if seeds were evaluated at different steps.
 
     :param curves: one per seed, each with at least one point
     :return: steps ``(n_points,)`` and values ``(n_seeds, n_points)``

@@ -38,7 +38,7 @@ COMPARISON_NOTES = (
 
 
 def success_table(results: Results) -> Table:
-    """All rows: per task and method the mean over seeds, its interval, and how the agents behave."""
+    """All rows: for each task and method the mean success over seeds, its interval, and statistics of the agents."""
     table = [list(HEADER)]
     for task, methods in results.items():
         table += [_success_row(task, method, runs) for method, runs in methods.items()]
@@ -65,7 +65,7 @@ def _success_row(task: str, method: str, runs: Sequence[Run]) -> list[str]:
 
 
 def steps_to_90(runs: Sequence[Run]) -> str:
-    """Mean steps until an evaluation first succeeds in 0.9 of its episodes, or how many seeds get there."""
+    """Mean steps until an evaluation first succeeds in 0.9 of its episodes, or how many seeds reach that."""
     first = [stats.steps_to(*run.curve, 0.9) for run in runs]
     reached = [steps for steps in first if steps is not None]
     all_reached = len(reached) == len(runs)
@@ -133,7 +133,7 @@ def _steps(runs: Sequence[Run]) -> str:
 
 
 def description_table(task: str, methods: Mapping[str, Sequence[Run]], descriptions: Descriptions) -> Table:
-    """What each row of a task is, its steps, minutes and machine, and what a reader must know of it."""
+    """Description of each row of a task, with its steps, minutes, machine and notes."""
     table = [["method", "what it is", "steps", "minutes", "machine", "notes"]]
     for method, runs in methods.items():
         minutes = [run.final["wall_time"] / 60 for run in runs if run.final.get("wall_time")]
@@ -146,7 +146,7 @@ def description_table(task: str, methods: Mapping[str, Sequence[Run]], descripti
 
 
 def spread_table(results: Results) -> Table:
-    """How far seeds lie apart, of the rows with three seeds or more."""
+    """Spread between seeds, for rows with three seeds or more."""
     table = [["task", "method", "seeds", "lowest", "10th percentile", "90th percentile", "highest"]]
     for task, methods in results.items():
         for method, runs in methods.items():
@@ -157,7 +157,7 @@ def spread_table(results: Results) -> Table:
 
 
 def overall_table(results: Results) -> Table:
-    """Interquartile mean of all runs with shipped settings, over the tasks that a method has runs of."""
+    """Interquartile mean of all runs with shipped settings, over all tasks for which a method has runs."""
     table = [["method", "tasks", "runs", "interquartile mean", "95 % interval"]]
     several = len(results) > 1
     names = list(dict.fromkeys(m for methods in results.values() for m in shipped(methods))) if several else []
@@ -175,7 +175,7 @@ def overall_table(results: Results) -> Table:
 
 
 def conditions_table(results: Results) -> Table:
-    """Baselines that were not run as ours was, and in what they differ (our value in brackets)."""
+    """Baselines that were not run under our conditions, and the differences (our value in brackets)."""
     table = [["task", "method", "differs from ours in"]]
     for task, rows in unequal_conditions(results).items():
         table += [[task, method, "; ".join(said)] for method, said in rows.items()]

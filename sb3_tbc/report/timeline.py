@@ -11,7 +11,7 @@ from sb3_tbc.aliases import Plain
 
 TRACE = "options.csv"
 MOST = 40
-"""Options that are drawn; of a longer episode the first ones."""
+"""Largest number of options drawn; of a longer episode the first ones are shown."""
 
 
 def last_episode(path: Path) -> list[Plain]:
@@ -25,7 +25,7 @@ def last_episode(path: Path) -> list[Plain]:
     with path.open(encoding="utf-8", newline="") as file:
         reader = csv.DictReader(file)
         if not {"env", "time_budget", "duration", "reached", "reason", "episode_over"} <= set(reader.fieldnames or ()):
-            raise ValueError(f"{path} is no trace of options: its columns are {reader.fieldnames}")
+            raise ValueError(f"{path} is not a trace of options: its columns are {reader.fieldnames}")
         for row in reader:
             if row["env"] != "0":
                 continue
@@ -41,10 +41,10 @@ def last_episode(path: Path) -> list[Plain]:
 def option_timeline(options: Sequence[Plain], title: str = "") -> str:
     """Options of one episode from top to bottom: the budget as a pale bar, the steps used as a dark one.
 
-    Reached subgoals have a tick at the end of their bar, missed ones a cross: told apart without colour.
+    Reached subgoals have a tick at the end of their bar, missed ones a cross, so that no colour is needed.
 
-    :param options: as :func:`last_episode` gives them
-    :param title: what is shown, for screen readers
+    :param options: result of :func:`last_episode`
+    :param title: title for screen readers
     :return: SVG text
     """
     shown = list(options)[:MOST]

@@ -158,7 +158,7 @@ def test_films_and_options_of_runs_are_shown(ledger: Path, tmp_path: Path) -> No
     assert float(bars[1].get("x", "nan")) > float(bars[0].get("x", "nan"))
     assert "option 2: 5 of 5 steps, subgoal missed (expired)" in [t.text for t in svg.iter("title")]
     (run / "other.csv").write_text("a,b\n")
-    with pytest.raises(ValueError, match="no trace of options"):
+    with pytest.raises(ValueError, match="not a trace of options"):
         last_episode(run / "other.csv")
 
 
