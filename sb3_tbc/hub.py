@@ -95,7 +95,7 @@ def load_from_hub(
     :param filename: name of the ``.zip`` in the repository
     :param env: environments to act in, if the agent is to go on learning
     :param device: torch device
-    :param trust: whether code that the file brings along may run, see :meth:`.PlainAlgorithm.load`
+    :param trust: whether code from the file may run, see :meth:`.PlainAlgorithm.load`
     :raises UntrustedError: if it cannot be loaded without that
     :raises ConfigError: if it cannot be downloaded or loaded
     """
