@@ -15,6 +15,13 @@ def _level(run: Run, level: str, key: str) -> object:
     return (model.get(level) or model).get(key)
 
 
+def _high_updates(run: Run) -> Any:
+    """Updates of the high level per environment step, where they are not the agent's."""
+    model = run.config.get("model") or {}
+    own = (model.get("high") or {}).get("gradient_ratio")
+    return None if own is None or own == model.get("gradient_ratio", 1.0) else own
+
+
 def _averaging(run: Run) -> str:
     decays = [_level(run, level, "average_decay") for level in ("high", "low")]
     return "default" if decays == [None, None] else " and ".join(str(decay) for decay in decays)
@@ -32,6 +39,7 @@ CONDITIONS: dict[str, Callable[[Run], object]] = {
     "training steps": lambda run: run.config.get("n_timesteps", run.final.get("n_timesteps")),
     "environments": lambda run: run.config.get("n_envs", 1),
     "updates per step": lambda run: (run.config.get("model") or {}).get("gradient_ratio", 1.0),
+    "high level's updates per step": _high_updates,
     "weight averaging": _averaging,
     "settings": lambda run: run.final.get("config"),
     "steps between evaluations": lambda run: run.config.get("eval_freq"),

@@ -275,6 +275,9 @@ class FlatConfig(Settings):
     """Temperature: a fixed one, ``auto``, or ``auto_<number>`` that starts there."""
     target_entropy: float | Literal["auto"] = "auto"
     """Entropy that an automatic temperature aims at; auto: minus the number of action dimensions."""
+    average_decay: Annotated[float, Range(0, 1, below=True)] = 0.0
+    """Decay per update of an averaged actor, which acts where deterministic actions are asked for; 0: no average, as in
+    Stable-Baselines3."""
     buffer_size: Annotated[int, Range(1, 1_000_000_000)] = 1_000_000
     """Largest number of transitions in the replay buffer."""
     learning_starts: Annotated[int, Range(0)] = 100

@@ -27,6 +27,7 @@ from sb3_tbc.smdp.guard import GuardedVecEnv, OnBadStep
 from sb3_tbc.smdp.hindsight import check_goal_strategy
 from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSettings, takes
+from sb3_tbc.tbc_hrl.averaged_policy import AveragedPolicy
 from sb3_tbc.tbc_hrl.calls import whole_steps
 from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.environment import attribute_of
@@ -68,6 +69,8 @@ class FlatSAC(PlainAlgorithm, SAC):
         self._resumed: Plain = {}
         self.stop_requested = False
         by_event = config.goal_strategy == "event"
+        if config.average_decay and policy in ("MultiInputPolicy", MultiInputPolicy):
+            policy = AveragedPolicy
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,
@@ -181,6 +184,15 @@ class FlatSAC(PlainAlgorithm, SAC):
         if updates and self._her_buffer().ep_length.any():
             self._owed -= updates
             self.train(updates, self.batch_size)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """SB3's updates; where an average of the actor is kept, it follows each of them."""
+        if not isinstance(self.policy, AveragedPolicy):
+            super().train(gradient_steps, batch_size)
+            return
+        for _ in range(gradient_steps):
+            super().train(1, batch_size)
+            self.policy.follow(self._n_updates, self.settings["average_decay"])
 
     @property
     def on_bad_step(self) -> OnBadStep:

@@ -55,11 +55,30 @@ def test_does_the_updates_asked_for(n_envs: int) -> None:
     assert idle._n_updates == 0
 
 
+def test_an_averaged_actor_is_what_is_evaluated(tmp_path: Any) -> None:
+    plain, model = (make(gradient_ratio=0.1, average_decay=decay).learn(300) for decay in (0.0, 0.9))
+    for name, value in plain.policy.state_dict().items():  # learning itself is the same
+        np.testing.assert_array_equal(model.policy.state_dict()[name].numpy(), value.numpy(), err_msg=name)
+    observation = Corridor().reset(seed=0)[0]
+    acts = [m.predict(observation, deterministic=True)[0] for m in (plain, model)]
+    assert not np.array_equal(*acts)
+    model.save(tmp_path / "model.zip")
+    loaded = FlatSAC.load(tmp_path / "model.zip", env=GoalVecEnv([Corridor]))
+    np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0], acts[1])
+    average = [p.detach().numpy().copy() for p in model.policy.average_actor.parameters()]
+    model.train(1, 16)
+    keep = min(0.9, (1 + model._n_updates) / (10 + model._n_updates))
+    parameters = zip(average, model.policy.average_actor.parameters(), model.actor.parameters(), strict=True)
+    for before, after, now in parameters:
+        np.testing.assert_allclose(after.numpy(), keep * before + (1 - keep) * now.detach().numpy(), atol=1e-6)
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.99])
 @pytest.mark.parametrize("n_envs", [1, 2])
-def test_chunks_learn_what_one_call_learns(n_envs: int) -> None:
-    expected = contents(make(n_envs, gradient_ratio=0.05).learn(480))
+def test_chunks_learn_what_one_call_learns(n_envs: int, decay: float) -> None:
+    expected = contents(make(n_envs, gradient_ratio=0.05, average_decay=decay).learn(480))
     for chunks in ([240, 240], [100, 2, 6, 212, 160], [20] * 24):
-        model = make(n_envs, gradient_ratio=0.05)
+        model = make(n_envs, gradient_ratio=0.05, average_decay=decay)
         for steps in chunks:
             model.learn(steps, reset_num_timesteps=False)
         assert_same(expected, contents(model))

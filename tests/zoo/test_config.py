@@ -11,6 +11,8 @@ import yaml
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.report.conditions import condition_values, differences
+from sb3_tbc.report.runs import Run
 from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import RunConfig, config_file, load_config, merge, parse_overrides, read_file
 from sb3_tbc.zoo.environments import make_envs, task_names
@@ -143,9 +145,11 @@ def test_paper_reading_of_the_window_end() -> None:
     assert load_config("hits", "Pendulum").model["low"]["policy_kwargs"]["ndbc"] is None
 
 
-def test_tuned_is_the_default_where_it_exists() -> None:
+def test_tuned_is_the_default_where_it_exists(tmp_path: Path) -> None:
     assert load_config("tbc-hrl", "Pendulum").config == "tuned"
-    assert load_config("hits", "UR5Reacher").config == "paper"
+    untuned = tmp_path / "hits.yml"
+    untuned.write_text("default: {n_timesteps: 10}")
+    assert load_config("hits", "UR5Reacher", path=untuned).config == "paper"
     assert load_config("tbc-hrl", "Pendulum") == load_config("tbc-hrl", "Pendulum", "tuned")
 
 
@@ -287,3 +291,18 @@ def test_every_flat_section_builds(task: str) -> None:
     finally:
         env.close()
     assert model.gradient_ratio == run.model["gradient_ratio"]
+
+
+@pytest.mark.parametrize("task", sorted(set(read_file(config_file("tbc-hrl"))) - {"default", "other"}))
+@pytest.mark.parametrize("algo", ["hits", "hac", "sac"])
+def test_shipped_baselines_run_under_our_conditions(algo: str, task: str) -> None:
+    """What the report compares conditions by finds nothing: observation, views, environments, updates, averages."""
+    ours, theirs = (
+        Run({"algo": name, "config": run.config, "n_timesteps": run.n_timesteps}, [], run.to_dict())
+        for name, run in ((name, load_config(name, task)) for name in ("tbc-hrl", algo))
+    )
+    assert differences([theirs], [ours]) == []
+    values = condition_values([theirs])
+    assert values["settings"] == ["tuned"]
+    assert values["weight averaging"][0] not in ("default", "0.0 and 0.0")
+    assert values["updates per step"] == [load_config("tbc-hrl", task).model.get("gradient_ratio", 1.0)]
