@@ -15,7 +15,7 @@ def _level(run: Run, level: str, key: str) -> object:
     return (model.get(level) or model).get(key)
 
 
-def _high_updates(run: Run) -> Any:
+def _high_updates(run: Run) -> object:
     """Updates of the high level per environment step, where they are not the agent's."""
     model = run.config.get("model") or {}
     own = (model.get("high") or {}).get("gradient_ratio")
