@@ -62,7 +62,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(
     content[len(content) // 2] ^= 1
     replay.write_bytes(content)
     before = find_checkpoint(folder)
-    assert "replay_buffer.pkl is damaged: it fails its checksum; going on from the checkpoint before" in caplog.text
+    assert "replay_buffer.pkl is damaged: it fails its checksum; resuming from the previous checkpoint" in caplog.text
     assert before is not None
     assert before.path.name == "checkpoint.old"
     assert not differences(undisturbed, finish(tmp_path / "runs", arguments, tmp_path / "log"))
