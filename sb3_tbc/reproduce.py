@@ -11,8 +11,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import yaml
-
 from sb3_tbc.campaign.campaign import Campaign
 from sb3_tbc.campaign.executors import Executor, LocalExecutor, RayExecutor, SlurmExecutor
 from sb3_tbc.campaign.hours import measured_speeds, plan
@@ -20,6 +18,7 @@ from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
 from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.reading import parse_yaml
 from sb3_tbc.train import variant_name
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
 from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, load_config, parse_overrides
@@ -113,7 +112,7 @@ def _slurm_settings(items: Sequence[str]) -> dict[str, object]:
     pairs = [item.partition(":") for item in items]
     if wrong := [item for item, (name, colon, _) in zip(items, pairs, strict=True) if not name or not colon]:
         raise ConfigError(f"--slurm takes name:value, e.g. timeout_min:600; got {wrong[0]!r}")
-    return {name: yaml.safe_load(value) for name, _, value in pairs}
+    return {name: parse_yaml(value, f"--slurm {name}") for name, _, value in pairs}
 
 
 def command(argv: Sequence[str]) -> int:

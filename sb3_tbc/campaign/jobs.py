@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_atomic
+from sb3_tbc.reading import read_json
 from sb3_tbc.zoo.ledger import RunFolder, to_json
 
 FAILED = "failed.json"
@@ -66,9 +67,18 @@ class Job:
         :return: the last line it wrote
         """
         record = self.target.path / FAILED
-        attempts = json.loads(record.read_text(encoding="utf-8"))["attempts"] if record.is_file() else 0
+        attempts = _attempts(record)
         text = self.log.read_text(encoding="utf-8", errors="replace").strip() if self.log.is_file() else ""
         last = text.splitlines()[-1] if text else ""
         row = {"task": self.env, "algo": self.algo, "variant": self.folder.path.parent.name, "seed": self.seed}
         write_atomic(record, to_json({**row, "exit_status": status, "attempts": attempts + 1, "message": last}))
         return last
+
+
+def _attempts(record: Path) -> int:
+    """How often a run failed before; a record that cannot be read counts as none."""
+    try:
+        found = read_json(record) if record.is_file() else {}
+        return int(found["attempts"]) if isinstance(found, dict) and "attempts" in found else 0
+    except (ConfigError, ValueError, TypeError, OverflowError):
+        return 0

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.outside import one_line
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
 SignMatrix = NDArray[np.int8]
 """Synapses as a matrix ``[presynaptic, postsynaptic]``: +1 excitatory, -1 inhibitory, 0 none."""
 
+MOST_NEURONS = 10_000
+"""Neurons of a layer; wirings are dense matrices."""
 logger = logging.getLogger(__name__)
 
 LAYERS = ("inter", "command", "motor")
@@ -89,8 +92,8 @@ class NDBCWiring:
         self, n_inputs: int, inter: int, command: int, motor: int, *, sensory_to: Sequence[str] = ("inter",)
     ) -> None:
         for name, size in {"n_inputs": n_inputs, "inter": inter, "command": command, "motor": motor}.items():
-            if not isinstance(size, int | np.integer) or size < 1:
-                raise ValueError(f"{name} must be a positive whole number, got {size!r}")
+            if not isinstance(size, int | np.integer) or not 1 <= size <= MOST_NEURONS:
+                raise ValueError(f"{name} must be a whole number from 1 to {MOST_NEURONS}, got {size!r}")
         self.n_inputs, self.inter, self.command, self.motor = int(n_inputs), int(inter), int(command), int(motor)
         self.sensory_to = (sensory_to,) if isinstance(sensory_to, str) else tuple(sensory_to)
         allowed = [LAYERS[: i + 1] for i in range(len(LAYERS))]
@@ -183,8 +186,16 @@ class NDBCWiring:
     def from_dict(cls, data: PlainMapping) -> NDBCWiring:
         """The wiring that :meth:`to_dict` described; or, given the constructor's numbers, a freshly drawn one.
 
-        :raises ValueError: if a synapse names a neuron that does not exist or has a polarity other than +1 and -1
+        :raises ValueError: if a synapse names a neuron that does not exist or has a polarity other than +1 and -1, or
+            the data describe no wiring
         """
+        try:
+            return cls._described(data)
+        except (TypeError, KeyError, IndexError, OverflowError, AttributeError) as error:
+            raise ValueError(f"this describes no wiring: {type(error).__name__}: {one_line(error)}") from error
+
+    @classmethod
+    def _described(cls, data: PlainMapping) -> NDBCWiring:
         if "synapses" not in data:
             return cls(**data)
         wiring = cls.__new__(cls)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
-import yaml
-
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.reading import read_yaml
 from sb3_tbc.report.runs import SHIPPED, Results
 
 CAMPAIGN = "campaign.yml"
@@ -25,7 +24,7 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
     if not path.is_file():
         return table
     try:
-        plan = yaml.safe_load(path.read_text(encoding="utf-8"))
+        plan = read_yaml(path)
         first = int(plan["first_seed"])
         for row in plan["runs"]:
             for method in row["methods"]:
@@ -34,7 +33,7 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
                 if done != wanted:
                     count = f"{len(done)} of {len(wanted)}"
                     table.append([row["task"], method, count, _command(plan, row, method)])
-    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ConfigError(f"cannot read the plan {path}: {error!r}") from error
     return table
 

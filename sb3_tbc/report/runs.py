@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -10,11 +9,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-import yaml
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.outside import one_line
+from sb3_tbc.reading import read_json, read_text, read_yaml
 from sb3_tbc.zoo.callbacks import EvaluationRow
 from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
 
@@ -124,12 +124,14 @@ def _load(folder: RunFolder) -> Run:
         raise ValueError(f"success_rate must be a number from 0 to 1, got {rate!r}")
     config = folder.read_config() if folder.exists else {}
     command = _text(folder.path / COMMAND).strip()
-    versions = json.loads(_text(folder.path / VERSIONS) or "{}")
+    versions = read_json(folder.path / VERSIONS) if (folder.path / VERSIONS).is_file() else {}
+    if not isinstance(versions, dict):
+        raise ValueError(f"{VERSIONS} must hold named values, got {type(versions).__name__}")
     return Run(final, folder.read_evaluations(), config, command, versions, folder.path)
 
 
 def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8") if path.is_file() else ""
+    return read_text(path) if path.is_file() else ""
 
 
 def _rank(method: str) -> tuple[bool, str]:
@@ -172,10 +174,9 @@ def _read_table(path: Path) -> dict[str, Plain]:
     if not path.is_file():
         return {}
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return {str(task): {str(k): v for k, v in lines.items()} for task, lines in data.items()}
-    except (OSError, yaml.YAMLError, AttributeError) as error:
-        raise ConfigError(f"cannot read {path}: {error}") from error
+        return {str(task): {str(k): v for k, v in lines.items()} for task, lines in read_yaml(path).items()}
+    except AttributeError as error:
+        raise ConfigError(f"{path} must hold two levels of names: {one_line(error)}") from error
 
 
 def describe(descriptions: Mapping[str, Mapping[str, str]], task: str, method: str) -> str:

@@ -21,6 +21,7 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import explained, replacing, save_atomic, write_atomic
 from sb3_tbc.outside import one_line
+from sb3_tbc.reading import read_text
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
@@ -50,20 +51,21 @@ def write_evaluations(path: Path, rows: Iterable[EvaluationRow]) -> None:
 def read_evaluations(path: Path) -> list[EvaluationRow]:
     """Read ``evaluations.csv``; a missing file is no evaluations.
 
-    :raises ValueError: if the file has other columns
+    :raises ConfigError: if it cannot be read or has other columns
     """
     if not path.is_file():
         return []
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
+    reader = csv.DictReader(io.StringIO(read_text(path), newline=""))
+    try:
         if tuple(reader.fieldnames or ()) != EvaluationRow._fields:
-            raise ValueError(
-                f"{path} must have the columns {', '.join(EvaluationRow._fields)}, got {reader.fieldnames}"
+            raise ConfigError(
+                f"{path} must have the columns {', '.join(EvaluationRow._fields)}, got {one_line(reader.fieldnames)}"
             )
-        try:
-            return [_parse_row(row) for row in reader]
-        except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
-            raise ConfigError(f"{path} holds a line that is not an evaluation: {one_line(error)}") from error
+        return [_parse_row(row) for row in reader]
+    except ConfigError:
+        raise
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
+        raise ConfigError(f"{path} holds a line that is not an evaluation: {one_line(error)}") from error
 
 
 def _parse_row(row: dict[str, str]) -> EvaluationRow:

@@ -32,8 +32,8 @@ class Sample(NamedTuple):
     files: int
 
 
-def torture_long(root: Path, number: int) -> tuple[int, int]:
-    """Five million steps on Drawbridge, or ``number``."""
+def torture_long(root: Path, number: int, first: int = 0) -> tuple[int, int]:
+    """Five million steps on Drawbridge, or ``number``; there is but one trial."""
     steps = number or STEPS
     arguments = [
         *("--env", "Drawbridge", "--n-envs", 4, "--n-timesteps", steps, "--eval-freq", max(steps // 25, 1)),

@@ -7,6 +7,7 @@ import signal
 import time
 from typing import Any, NamedTuple
 
+import gymnasium as gym
 import numpy as np
 from corridor import Corridor
 from gymnasium import spaces
@@ -90,3 +91,14 @@ def _subgoals() -> Any:
     return SubgoalSpace.from_slices(
         [-1.0], [1.0], [0.05], [("achieved_goal", 0, 1)], local_scale=[1.0, 50.0, 100.0], names=["position"]
     )
+
+
+class Once(Faulty):
+    """As a registered environment: its fault is named in words."""
+
+    def __init__(self, kind: str = "", key: str = "observation", episode: int = 12, **_: Any) -> None:
+        super().__init__(Fault(kind, key, episode) if kind else None)
+
+
+if "FaultyCorridor-v0" not in gym.registry:
+    gym.register("FaultyCorridor-v0", Once)

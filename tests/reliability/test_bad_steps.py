@@ -232,21 +232,11 @@ def test_in_evaluations(algo: str) -> None:
     assert len(result.successes) == 10
 
 
-class Once(Faulty):
-    """As a registered environment: its fault is named in words."""
-
-    def __init__(self, kind: str = "", key: str = "observation", episode: int = 12, **_: Any) -> None:
-        super().__init__(Fault(kind, key, episode) if kind else None)
-
-
-gym.register("FaultyCorridor-v0", Once)
-
-
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_the_command_ends_saved_and_is_resumed(algo: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["gradient_ratio:0.05", *(["batch_size:8"] if algo == "sac" else ["low.batch_size:8", "high.batch_size:8"])]
     small += [] if algo == "sac" else ["compile:false", "max_options:3"]
-    arguments = ["--env", "FaultyCorridor-v0", "--algo", algo, "--n-timesteps", "400", "--eval-freq", "100000"]
+    arguments = ["--env", "faulty:FaultyCorridor-v0", "--algo", algo, "--n-timesteps", "400", "--eval-freq", "100000"]
     arguments += ["--n-final-episodes", "1", "--no-progress", "--keep-checkpoint", "--log-folder", str(tmp_path)]
     fault = ["env_kwargs.kind:nan", "env_kwargs.key:achieved_goal"]
     assert train.main([*arguments, "--hyperparams", *small, *fault]) == 1

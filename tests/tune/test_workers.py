@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import pwd
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +13,7 @@ from pathlib import Path
 import optuna
 import pytest
 from optuna.trial import TrialState
+from postgres import private_server
 
 from sb3_tbc.tune.study import COUNTED, ORIGIN, WORKER, count_done, open_storage
 
@@ -118,52 +117,15 @@ def test_a_stop_puts_running_trials_back(tmp_path: Path) -> None:
 # --------------------------------------------------------------------------------------------- PostgreSQL
 
 
-def postgres_folder() -> Path | None:
-    """Where Debian's package (or the PATH) has the server's programs."""
-    found = shutil.which("postgres")
-    if found is not None:
-        return Path(found).resolve().parent
-    installed = sorted(Path("/usr/lib/postgresql").glob("*/bin/postgres"))
-    return installed[-1].parent if installed else None
+@pytest.fixture
+def postgres() -> Iterator[str]:
+    """The URL of a private server."""
+    with private_server() as url:
+        if url is None:
+            pytest.skip("PostgreSQL is not installed; scripts/install-postgres.sh brings it")
+        yield url
 
 
-if postgres_folder() is not None:  # scripts/install-postgres.sh brings it
-
-    @pytest.fixture
-    def postgres(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-        """A private server on a socket in a temporary folder; gives the URL. It refuses to run as root."""
-        programs = postgres_folder()
-        assert programs is not None
-        folder = Path("/tmp") / f"sb3_tbc_postgres_{os.getpid()}"  # a socket's path must be short
-        folder.mkdir(mode=0o777)
-        prefix: list[str] = []
-        if os.getuid() == 0:
-            account = pwd.getpwnam("postgres")
-            os.chown(folder, account.pw_uid, account.pw_gid)
-            prefix = ["runuser", "-u", "postgres", "--"]
-
-        def run(program: str, *arguments: str) -> None:
-            subprocess.run(
-                [*prefix, str(programs / program), *arguments],
-                check=True,
-                stdout=subprocess.DEVNULL,
-                cwd="/tmp",
-                timeout=120,
-            )
-
-        data = str(folder / "data")
-        try:
-            run("initdb", "-D", data, "-U", "tuner", "--auth=trust", "--no-sync", "-E", "UTF8")
-            options = f"-k {folder} -c listen_addresses='' -c fsync=off"
-            run("pg_ctl", "-D", data, "-w", "-l", str(folder / "log"), "-o", options, "start")
-            try:
-                run("createdb", "-h", str(folder), "-U", "tuner", "studies")
-                yield f"postgresql+psycopg://tuner@/studies?host={folder}"
-            finally:
-                run("pg_ctl", "-D", data, "-w", "-m", "immediate", "stop")
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-
-    @pytest.mark.slow
-    def test_a_killed_worker_on_postgresql(tmp_path: Path, postgres: str) -> None:
-        check(*kill_one_worker_within_a_trial(tmp_path, postgres))
+@pytest.mark.slow
+def test_a_killed_worker_on_postgresql(tmp_path: Path, postgres: str) -> None:
+    check(*kill_one_worker_within_a_trial(tmp_path, postgres))
