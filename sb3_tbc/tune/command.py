@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING
 import torch as th
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.outside import flat_name, folder_name
+from sb3_tbc.stopping import stop_request
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tune.objectives import ACROSS, OBJECTIVES
 from sb3_tbc.tune.search_space import complete, load_space, restrict
@@ -252,7 +253,6 @@ def search(args: argparse.Namespace, study: Study, settings: StudySettings, stor
     from sb3_tbc.tune.worker import Job, run_workers
 
     try_sampler(args.sampler, settings)
-    stop_like_ctrl_c()
     runs = f"{settings.n_seeds} seeds of {settings.run.n_timesteps:,} steps each"
     print(f"study          {study.study_name}: {settings.algo} on {settings.task}, {settings.objective}, {runs}")
     print(f"storage        {shown(storage)}   ({count_done(study)} of {args.n_trials} trials done)")
@@ -262,7 +262,8 @@ def search(args: argparse.Namespace, study: Study, settings: StudySettings, stor
               args.device, args.grace_seconds, until)  # fmt: skip
     status = 0
     try:
-        status = run_workers(job, args.workers)
+        with stop_request() as stop:
+            status = run_workers(job, args.workers, stop)
     except KeyboardInterrupt:
         print("\nstopped; the same command continues", file=sys.stderr)
         status = INTERRUPTED

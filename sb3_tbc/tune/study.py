@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import datetime
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import optuna
-from optuna.storages import BaseStorage, RDBStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
-from optuna.storages._heartbeat import BaseHeartbeat
-from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock, JournalStorage
+from optuna.storages import BaseStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
+from optuna.storages.journal import JournalFileSymlinkLock
 from optuna.storages.journal._file import get_lock_file
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
@@ -25,6 +23,7 @@ from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.files import explained, write_atomic
 from sb3_tbc.outside import HIDDEN, one_line, without_password
+from sb3_tbc.tune.heartbeat import DatabaseWithHeartbeat, JournalWithHeartbeat
 from sb3_tbc.tune.objectives import OBJECTIVES
 from sb3_tbc.tune.search_space import Space, Values, apply, build_space, project, suggest
 from sb3_tbc.zoo.config import RunConfig
@@ -42,7 +41,6 @@ COUNTED = (TrialState.COMPLETE, TrialState.PRUNED)
 MAX_RETRIES = 3
 shown = without_password
 JOURNAL_SUFFIXES = (".log", ".journal")
-Retry = Callable[[Study, FrozenTrial], None]
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
 
@@ -134,51 +132,6 @@ class StudySettings:
         return apply(self.parameters, values, self.run)
 
 
-class JournalWithHeartbeat(JournalStorage, BaseHeartbeat):
-    """A journal file with a heartbeat of running trials; Optuna has one for databases, but not for journals.
-
-    The heartbeat is the modification time of a small file beside the journal, measured by the file system's clock.
-
-    :param path: the journal
-    :param interval: seconds between heartbeats
-    :param grace: seconds without a heartbeat after which a trial is given to another worker
-    :param callback: called with such a trial
-    """
-
-    def __init__(self, path: Path, interval: int, grace: int, callback: Retry) -> None:
-        super().__init__(JournalFileBackend(str(path)))
-        self._folder = path.with_name(path.name + ".alive")
-        self._folder.mkdir(exist_ok=True)
-        self._interval, self._grace, self._callback = interval, grace, callback
-
-    def record_heartbeat(self, trial_id: int) -> None:
-        """Record that a trial's worker is alive."""
-        (self._folder / f"trial_{trial_id}").touch()
-
-    def _get_stale_trial_ids(self, study_id: int) -> list[int]:
-        running = self.get_all_trials(study_id, deepcopy=False, states=(TrialState.RUNNING,))
-        if not running:
-            return []
-        clock = self._folder / "clock"
-        clock.touch()
-        now = clock.stat().st_mtime
-        return [t._trial_id for t in running if now - self._last_sign(t) > self._grace]
-
-    def _last_sign(self, trial: FrozenTrial) -> float:
-        try:
-            return (self._folder / f"trial_{trial._trial_id}").stat().st_mtime
-        except FileNotFoundError:
-            return (trial.datetime_start or datetime.datetime.now()).timestamp()
-
-    def get_heartbeat_interval(self) -> int:
-        """Seconds between heartbeats."""
-        return self._interval
-
-    def get_heartbeat_stale_trial_callback(self) -> Retry:
-        """The function that queues a dead worker's trial again."""
-        return self._callback
-
-
 def is_url(storage: str) -> bool:
     """Whether a storage is a database rather than a journal file."""
     return "://" in storage
@@ -203,7 +156,7 @@ def open_storage(storage: str, grace: int = 120) -> BaseStorage:
 def _open(storage: str, grace: int) -> BaseStorage:
     retry, interval = RetryHeartbeatStaleTrialCallback(max_retry=MAX_RETRIES), max(1, grace // 4)
     if is_url(storage):
-        database = RDBStorage(
+        database = DatabaseWithHeartbeat(
             storage,
             engine_kwargs={"pool_pre_ping": True},
             heartbeat_interval=interval,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
-import signal
 import sys
 import time
 import traceback
@@ -14,7 +13,6 @@ from dataclasses import dataclass
 from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
-from types import FrameType
 
 import optuna
 import torch as th
@@ -23,6 +21,7 @@ from optuna.trial import FrozenTrial, TrialState
 
 from sb3_tbc.commands import INTERRUPTED, USER_MISTAKE
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.tune.pruning import SEED_VALUES, make_pruner
 from sb3_tbc.tune.study import (
     ORIGIN,
@@ -73,7 +72,7 @@ class Job:
     until: float = math.inf
 
 
-def load(job: Job, index: int) -> tuple[Study, TrialRunner]:
+def load(job: Job, index: int, stop: StopRequest) -> tuple[Study, TrialRunner]:
     """Open a worker's study with its own sampler.
 
     :raises ConfigError: for unknown names and a storage that cannot be opened
@@ -83,20 +82,23 @@ def load(job: Job, index: int) -> tuple[Study, TrialRunner]:
     study.sampler = make_sampler(job.sampler, job.seed, (index, len(study.get_trials(deepcopy=False))))
     study.pruner = make_pruner(job.pruner, settings.n_evaluations, settings.n_seeds)
     resolve_env(settings.env)  # imports the module that registers it
-    options = RunOptions(device=job.device, verbose=0, checkpoint_seconds=math.inf, save_at_end=False)
+    options = RunOptions(device=job.device, verbose=0, checkpoint_seconds=math.inf, save_at_end=False, stop=stop)
     return study, TrialRunner(settings, job.folder, job.n_trials, options, partial(_say, index))
 
 
-def work(job: Job, index: int) -> None:
+def work(job: Job, index: int, stop: StopRequest) -> None:
     """Run trials until the study has enough of them.
 
     A worker waits while other workers run the last trials: if one of them dies, its trial must be run again.
 
+    :param stop: whether the user asked to stop: looked at between steps, so that no write is interrupted
     :raises KeyboardInterrupt: when stopped, after the trial was put back into the queue
     """
-    study, runner = load(job, index)
+    study, runner = load(job, index, stop)
     parent = os.getppid()
     while time.time() < job.until and os.getppid() == parent:
+        if stop:
+            raise KeyboardInterrupt
         retire_stale(study)
         done = count_done(study)
         if done >= job.n_trials:
@@ -168,31 +170,31 @@ def _say(index: int, text: str) -> None:
 # --------------------------------------------------------------------------------------------- processes
 
 
-def run_workers(job: Job, n: int) -> int:
+def run_workers(job: Job, n: int, stop: StopRequest) -> int:
     """Run ``n`` workers, in this process if it is one, and return an exit status.
 
+    :param stop: whether the user asked to stop
     :raises KeyboardInterrupt: when stopped, after the workers have put their trials back
     """
     if n == 1:
-        work(job, 0)
+        work(job, 0, stop)
         return 0
     context = multiprocessing.get_context("spawn")
     workers = [context.Process(target=_main, args=(job, index), name=f"worker {index}") for index in range(n)]
     for worker in workers:
         worker.start()
-    try:
-        _watch(workers)
-    except KeyboardInterrupt:
+    _watch(workers, stop)
+    if stop:
         _stop(workers)
-        raise
+        raise KeyboardInterrupt
     codes = [worker.exitcode for worker in workers]
     return next((code for code in (0, USER_MISTAKE, INTERRUPTED) if code in codes), 1)
 
 
-def _watch(workers: Sequence[BaseProcess]) -> None:
-    """Wait for all workers, and report each one that dies."""
+def _watch(workers: Sequence[BaseProcess], stop: StopRequest) -> None:
+    """Wait for all workers, or until a stop is asked for, and report each one that dies."""
     waiting = list(workers)
-    while waiting:
+    while waiting and not stop:
         for worker in [w for w in waiting if not w.is_alive()]:
             waiting.remove(worker)
             code = worker.exitcode or 0
@@ -205,8 +207,7 @@ def _watch(workers: Sequence[BaseProcess]) -> None:
 
 
 def _stop(workers: Sequence[BaseProcess]) -> None:
-    """Let every worker put its trial back; a second Ctrl-C is ignored meanwhile, so that no worker is left running."""
-    before = {number: signal.signal(number, _stopping) for number in (signal.SIGINT, signal.SIGTERM)}
+    """Let every worker put its trial back."""
     for worker in workers:
         if worker.is_alive():
             worker.terminate()
@@ -214,19 +215,15 @@ def _stop(workers: Sequence[BaseProcess]) -> None:
         worker.join(STOP_SECONDS)
         if worker.is_alive():
             worker.kill()  # without a heartbeat its trial will be run again
-    for number, handler in before.items():
-        signal.signal(number, handler)
 
 
 def _main(job: Job, index: int) -> None:
     """Main function of a worker process: one thread, one orderly stop, user errors in one line."""
     os.environ["OMP_NUM_THREADS"] = "1"
     th.set_num_threads(1)
-    signal.signal(signal.SIGTERM, _interrupt_once)
-    if signal.getsignal(signal.SIGINT) != signal.SIG_IGN:  # a script in the background ignores Ctrl-C
-        signal.signal(signal.SIGINT, _interrupt_once)
     try:
-        work(job, index)
+        with stop_request() as stop:
+            work(job, index, stop)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
     except ConfigError as error:
@@ -235,14 +232,3 @@ def _main(job: Job, index: int) -> None:
     except Exception:
         traceback.print_exc()
         sys.exit(1)
-
-
-def _interrupt_once(number: int, frame: FrameType | None) -> None:
-    """Interrupt at the first signal only: both the terminal and the parent process may send one."""
-    signal.signal(signal.SIGTERM, _stopping)
-    signal.signal(signal.SIGINT, _stopping)
-    raise KeyboardInterrupt
-
-
-def _stopping(number: int, frame: FrameType | None) -> None:
-    """Ignore further signals while stopping."""

@@ -117,8 +117,8 @@ def algorithm_of(path: Path, data: Plain) -> str:
     """
     info, policy = data.get(RUN_INFO), data.get("policy_class")
     name = info.get("algo") if isinstance(info, dict) else None
-    if name in ALGORITHMS:
-        return str(name)
+    if isinstance(name, str) and name in ALGORITHMS:
+        return name
     origin = policy.get("__module__") if isinstance(policy, dict) else None
     if name is None and str(origin).startswith("sb3_tbc.tbc_hrl"):  # saved by model.save, without the runner
         settings = data.get("settings", data)  # version 0.1.0 kept them among its other attributes

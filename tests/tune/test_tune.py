@@ -19,6 +19,7 @@ import yaml
 from optuna.trial import TrialState
 
 from sb3_tbc import train
+from sb3_tbc.stopping import StopRequest
 from sb3_tbc.tbc_hrl.level_config import CircuitConfig
 from sb3_tbc.tune import command as tune
 from sb3_tbc.tune import study as studies
@@ -315,7 +316,7 @@ def test_a_trial_too_many_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyP
     quick(monkeypatch, lambda spec, folder, after_eval: None)
     assert tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY)) == 0
     job = worker.Job(str(tmp_path / NAME / "journal.log"), NAME, tmp_path, 2, "random", "none", 0, "cpu", 60)
-    study, runner = worker.load(job, 0)
+    study, runner = worker.load(job, 0, StopRequest())
     worker._one_trial(study, runner, 0)  # as if another had taken the last one in the same moment
     assert [t.state for t in study.trials] == [TrialState.COMPLETE, TrialState.COMPLETE, TrialState.FAIL]
     assert studies.count_done(study) == 2
@@ -324,11 +325,11 @@ def test_a_trial_too_many_is_dropped(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_baseline_queued_twice_runs_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seeds = quick(monkeypatch, lambda spec, folder, after_eval: None)
 
-    def queue_twice(job: worker.Job, n: int) -> int:
+    def queue_twice(job: worker.Job, n: int, stop: StopRequest) -> int:
         study = load(tmp_path)
         (values,) = (t.system_attrs["fixed_params"] for t in study.trials)
         study.enqueue_trial(values, user_attrs={ORIGIN: "default"})  # as if two machines had begun the study at once
-        return run_workers(job, n)
+        return run_workers(job, n, stop)
 
     run_workers = worker.run_workers
     monkeypatch.setattr(worker, "run_workers", queue_twice)
@@ -355,7 +356,7 @@ def test_a_study_that_another_machine_is_just_creating_is_joined(tmp_path: Path)
 
 def test_ctrl_c_in_a_background_script_is_not_for_the_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     handlers: list[Any] = []
-    monkeypatch.setattr(worker, "work", lambda job, index: handlers.append(signal.getsignal(signal.SIGINT)))
+    monkeypatch.setattr(worker, "work", lambda job, index, stop: handlers.append(signal.getsignal(signal.SIGINT)))
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     job = worker.Job("study.log", NAME, Path(), 1, "random", "none", 0, "cpu", 60)
     try:
@@ -365,7 +366,8 @@ def test_ctrl_c_in_a_background_script_is_not_for_the_workers(monkeypatch: pytes
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-    assert handlers == [signal.SIG_IGN, worker._interrupt_once]
+    assert handlers[0] == signal.SIG_IGN
+    assert handlers[1].__func__ is StopRequest.ask  # a flag, looked at between steps: nothing is interrupted
 
 
 def test_a_refused_combination_is_pruned_not_fatal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
