@@ -11,7 +11,7 @@ SEED ?= 0
 STEPS ?= $(if $(filter Pendulum,$(ENV)),100000,)
 RUN := runs/$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: help install browser train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks torture bench report pretrained clean
+.PHONY: help install browser train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks torture bench report pretrained lowest newest clean
 
 help:
 	@echo "install          .venv with the package (editable) and what its tests need"
@@ -23,6 +23,7 @@ help:
 	@echo "report           the results page of the docs and the HTML report, from the ledger in results/"
 	@echo "doc notebooks    build the pages, run the notebooks        bench  steps per second"
 	@echo "torture          kill, stop and damage runs, for the table of docs/reliability.md; takes hours"
+	@echo "lowest newest    the tests of SB3's contract with the lowest, or the newest, supported versions"
 	@echo "pretrained       train the agents that come with the package [TASKS=]"
 
 # The stamp is newer than the files that determine what is installed, so nothing is installed twice.
@@ -89,5 +90,8 @@ pretrained: install
 	$(BIN)/python scripts/pretrained.py $(TASKS)
 	$(BIN)/python scripts/interpretation.py
 
+lowest newest:
+	PYTHON=$(PYTHON) scripts/versions.sh $@
+
 clean:
-	rm -rf build dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv-lowest .venv-newest build dist docs/_build .mypy_cache .ruff_cache .pytest_cache .hypothesis

@@ -33,7 +33,12 @@ def make_task(task: str, perturb: PlainMapping | None = None, **kwargs: object) 
     """
     if task not in _CLASSES:
         raise ValueError(f"task must be one of {TASKS}, got {task!r}")
-    task_class = getattr(import_module(f"{__name__}.{_CLASSES[task][0]}"), task)
+    try:
+        task_class = getattr(import_module(f"{__name__}.{_CLASSES[task][0]}"), task)
+    except (ImportError, AttributeError) as error:
+        if "mujoco" not in str(error).lower():
+            raise
+        raise import_module(f"{__name__}.mujoco_install").half_upgraded(error) from error
     env: Env = task_class(**kwargs)
     if not perturb:
         return env

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .base import Array, GoalTask
+from .mujoco_install import check_mujoco
 from .mujoco_rendering import Scene
 from .rendering import Canvas
 
@@ -34,6 +35,7 @@ class MujocoTask(GoalTask):
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
     ) -> None:
+        check_mujoco(mujoco)
         self.data = mujoco.MjData(mujoco.MjModel.from_xml_string(self.xml))
         self._reconnect()
         self._scene: Scene | None = None

@@ -174,7 +174,7 @@ def _read_plain(value: object, kind: object, name: str) -> object:
         return value if isinstance(value, type) and issubclass(value, get_args(kind)) else _WRONG
     if kind is int or kind is float:
         return _read_number(value, whole=kind is int)
-    return value if isinstance(value, typing.cast(type, kind)) else _WRONG
+    return value if isinstance(value, typing.cast(type, origin or kind)) else _WRONG
 
 
 def _read_number(value: object, whole: bool) -> object:

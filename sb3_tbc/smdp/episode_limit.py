@@ -24,7 +24,7 @@ from sb3_tbc.aliases import Env, Plain, Space, Wrapper
 from sb3_tbc.arrays import Arrays, BoolArray, FloatArray
 from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.faults import fault
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, goal_space_problems
 from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
 ANNOUNCE = "announce_last_window"
@@ -135,7 +135,9 @@ class EpisodeLimit(Wrapper, RecordConstructorArgs):
         return {key: np.zeros(shape or (), self._parts[key].dtype) for key, shape in self._shapes}
 
     def _as_declared(self, observation: GoalObservation) -> GoalObservation:
-        """The observation in the precision in which vectors of environments hand it on."""
+        """The observation in the precision in which vectors of environments hand it on; empty where it is no goal's."""
+        if not all(key in self._parts for key in GOAL_KEYS):  # wrappers of the vector make the goals: steps count alone
+            return {}
         return {key: np.asarray(observation[key], dtype=self._parts[key].dtype) for key in GOAL_KEYS}
 
 
@@ -234,7 +236,9 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         self._lengths += 1
         for index, window in list(self._last.items()):
             self._passed[index] += 1
-            seen: GoalObservation = {key: observation[key][index] for key in GOAL_KEYS}  # type: ignore[call-overload]
+            seen: GoalObservation = {}
+            if isinstance(observation, dict):
+                seen = {key: observation[key][index] for key in GOAL_KEYS if key in observation}
             if not dones[index] and window.over(int(self._passed[index]), seen):
                 self._end(index, observation, dones, infos[index])  # type: ignore[arg-type]
         for ended in np.flatnonzero(dones):
@@ -355,11 +359,15 @@ def can_tell(venv: VecEnv, subgoals: SubgoalSpace) -> bool:
 
 
 def _put_limit(env: Env, index: int) -> Env:
-    """Put the limit around the task itself, beneath its wrappers; the outermost environment."""
-    if not isinstance(env, gym.Wrapper):
-        return EpisodeLimit(env, index)
-    inner = env
-    while isinstance(inner.env, gym.Wrapper):
-        inner = inner.env
-    inner.env = EpisodeLimit(inner.env, index)
+    """Put the limit around the task, beneath the wrappers of a goal environment; the outermost environment."""
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    goals = [place for place, layer in enumerate(layers) if not goal_space_problems(layer.observation_space)]
+    task = max(goals, default=len(layers) - 1)  # a wrapper may have made the goals
+    limited = EpisodeLimit(layers[task], index)
+    if task == 0:
+        return limited
+    holder: Any = layers[task - 1]
+    holder.env = limited
     return env

@@ -1,14 +1,17 @@
-"""Subgoal spaces: what the high level may ask for and when it counts as reached. NumPy only."""
+"""Subgoal spaces: what the high level may ask for and when it counts as reached. NumPy and Gymnasium only."""
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_tbc.aliases import Plain, Space
 from sb3_tbc.arrays import AnyArray
 from sb3_tbc.arrays import FloatArray as FloatArray
 
@@ -51,7 +54,7 @@ class Slices:
 
         :raises ValueError: if a part has another form
         """
-        return cls(tuple(_slice(part) for part in given))
+        return cls(tuple(map(_slice, given)))
 
 
 def _slice(given: Part) -> Slice:
@@ -112,6 +115,20 @@ class SubgoalSpace:
         self.event = event
         self.rotations = tuple(rotations)
         self._check()
+
+    def __reduce__(self) -> tuple[object, ...]:  # type: ignore[override]
+        """Travel to other processes whatever the maps are: functions without a name of their own go by value."""
+        try:
+            pickle.dumps((self._achieved, self._local))
+        except (pickle.PicklingError, AttributeError, TypeError):
+            import cloudpickle  # one of SB3's dependencies, for what pickle cannot do
+
+            return _from_bytes, (type(self), cloudpickle.dumps(vars(self)))
+        return _restored, (type(self), vars(self))
+
+    def __deepcopy__(self, memo: object) -> SubgoalSpace:
+        """Nothing in a space ever changes, so that copies share what it holds."""
+        return _restored(type(self), vars(self))
 
     def _check(self) -> None:
         if self.low.ndim != 1 or self.low.shape != self.high.shape or not np.all(self.low < self.high):
@@ -197,6 +214,26 @@ class SubgoalSpace:
             per_coordinate[list(group)] = threshold
         return per_coordinate
 
+    def check_fits(self, space: Space) -> None:
+        """Refuse an environment whose observations these maps do not read as they say.
+
+        :param space: of goal observations
+        :raises ValueError: naming both sizes
+        """
+        if not isinstance(space, spaces.Dict):
+            return
+        blank = {key: np.zeros(part.shape or ()) for key, part in space.spaces.items()}
+        for name, found, wanted in (
+            ("achieved", self.achieved(blank), self.dim),
+            ("local", self.local(blank), self.local_dim),
+        ):
+            if np.shape(found) != (wanted,):
+                raise ValueError(
+                    f"the subgoal space's {name} map gives {np.shape(found)} of an observation, its own size is "
+                    f"({wanted},): it was made for other observations. A wrapper that changes them (VecFrameStack) "
+                    "needs a subgoal space of its own, subgoals=SubgoalSpace(...)"
+                )
+
     def achieved(self, observation: GoalObservation) -> FloatArray:
         """Subgoal-space point of a goal observation, ``(..., subgoal_dim)``, task units."""
         return self._achieved(observation)
@@ -230,6 +267,16 @@ class SubgoalSpace:
     def unscale(self, unit: FloatArray) -> FloatArray:
         """From [-1, 1] coordinates to task units."""
         return np.asarray(self.low + 0.5 * (unit + 1.0) * (self.high - self.low))
+
+
+def _restored(kind: type[SubgoalSpace], state: Plain) -> SubgoalSpace:
+    space = object.__new__(kind)
+    vars(space).update(state)
+    return space
+
+
+def _from_bytes(kind: type[SubgoalSpace], state: bytes) -> SubgoalSpace:
+    return _restored(kind, pickle.loads(state))
 
 
 def angle_between(one: FloatArray, other: FloatArray) -> FloatArray:

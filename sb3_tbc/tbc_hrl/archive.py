@@ -35,6 +35,7 @@ def read_bytes(path: str | Path | io.BufferedIOBase) -> bytes:
     :raises ConfigError: if it is missing or cannot be read
     """
     if not isinstance(path, str | Path):
+        path.seek(0)  # as SB3 does not mind where writing has left it
         return path.read()
     given = Path(path)
     file = given if given.suffix or given.is_file() else given.with_suffix(".zip")

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import warnings
 from numbers import Integral, Real
 from typing import Any
 
+import torch as th
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 
@@ -22,6 +24,17 @@ def whole_steps(total_timesteps: Any) -> int:
     return int(total_timesteps)
 
 
+def device_here(device: th.device | str) -> th.device | str:
+    """Where to load an agent: the CPU, with a warning, if a GPU is asked for that torch does not find.
+
+    SB3 does so silently; agents trained on a GPU must load on machines without one.
+    """
+    if str(device).startswith("cuda") and not th.cuda.is_available():
+        warnings.warn(f"device {str(device)!r} is not there: the agent is loaded on the CPU", stacklevel=3)
+        return "cpu"
+    return device
+
+
 def refuse_vec_normalize(env: VecEnv) -> None:
     """Refuse environments that normalise observations.
 
@@ -35,6 +48,18 @@ def refuse_vec_normalize(env: VecEnv) -> None:
 
 OF_A_LEVEL = ("gamma", "tau", "batch_size", "buffer_size", "ent_coef", "target_entropy", "learning_rate")
 """What SB3's agents of one level let users change between two calls of ``learn``."""
+
+
+def explain_level_setting(name: str) -> None:
+    """Say where to read what each level has for itself.
+
+    :raises AttributeError: if it is such a setting
+    """
+    if name in OF_A_LEVEL:
+        raise AttributeError(
+            f"{name} belongs to a level, and there are two: read model.low_settings[{name!r}] and "
+            f"model.high_settings[{name!r}]"
+        )
 
 
 def refuse_level_setting(name: str, value: object) -> None:

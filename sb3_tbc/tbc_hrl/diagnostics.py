@@ -11,9 +11,10 @@ from typing import Protocol
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.logger import HParam, TensorBoardOutputFormat
 from stable_baselines3.common.utils import safe_mean
 
-from sb3_tbc.aliases import Plain
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.smdp.hindsight import HighLevelSteps
 from sb3_tbc.smdp.options import Episode
 
@@ -60,6 +61,35 @@ def record_progress(model: BaseAlgorithm) -> None:
     if model.ep_success_buffer:
         logger.record("rollout/success_rate", safe_mean(model.ep_success_buffer))
     logger.record("train/n_updates", model._n_updates)
+
+
+METRICS = ("eval/success_rate", "rollout/success_rate", "rollout/ep_rew_mean")
+"""What TensorBoard shows beside the settings of a run."""
+
+
+def record_settings(model: BaseAlgorithm, settings: PlainMapping) -> None:
+    """Let TensorBoard show an agent's settings as hyperparameters, once for each of its files.
+
+    :param settings: plain data; sections become dotted names
+    """
+    logger = model.logger
+    if not any(isinstance(form, TensorBoardOutputFormat) for form in logger.output_formats):
+        return
+    if getattr(model, "_settings_told_to", None) is logger:
+        return
+    model._settings_told_to = logger  # type: ignore[attr-defined]
+    told = HParam({"algorithm": type(model).__name__, **_dotted(settings)}, dict.fromkeys(METRICS, 0.0))
+    logger.record("hparams", told, exclude=("stdout", "log", "json", "csv"))
+
+
+def _dotted(settings: PlainMapping, prefix: str = "") -> dict[str, bool | str | float | int | None]:
+    flat: dict[str, bool | str | float | int | None] = {}
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            flat |= _dotted(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = value if isinstance(value, bool | int | float) else str(value)
+    return flat
 
 
 class ProgressBar(Protocol):

@@ -45,6 +45,8 @@ def episode_length(env: VecEnv) -> int | None:
     else:
         keeps_own = attribute_of(env, "truncates_itself") in (None, True)
         limit = declared_limit(attribute_of(env, "spec"), attribute_of(env, "max_episode_steps"), keeps_own)
+        wrapped = attribute_of(env, "_max_episode_steps")  # of the outermost TimeLimit
+        limit = min(limit, int(wrapped)) if limit and wrapped else limit or wrapped
     return limit
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 import warnings
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
@@ -19,6 +19,7 @@ from sb3_tbc.arrays import Arrays
 from sb3_tbc.files import write_arrays
 from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.both_levels import MORE
+from sb3_tbc.settings import hints, read_partial
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_spaces import check_goal_space
 from sb3_tbc.smdp.goal_test import TRIED, check_goal_test
@@ -30,8 +31,10 @@ from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSe
 from sb3_tbc.tbc_hrl.averaged_policy import AveragedPolicy
 from sb3_tbc.tbc_hrl.calls import whole_steps
 from sb3_tbc.tbc_hrl.config import FlatConfig
+from sb3_tbc.tbc_hrl.diagnostics import record_settings
 from sb3_tbc.tbc_hrl.environment import attribute_of
 from sb3_tbc.tbc_hrl.flat_replay import TerminatingHerReplayBuffer
+from sb3_tbc.tbc_hrl.former_settings import check_sb3_names
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
@@ -61,11 +64,13 @@ class FlatSAC(PlainAlgorithm, SAC):
 
     @takes(FlatArguments)
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str, **arguments: object) -> None:
+        check_sb3_names(arguments)
         sb3, settings = SB3Arguments.taken_from(arguments)
         config = self.config_class.from_dict(settings)
         self.settings = config.to_dict()
         self.gradient_ratio = config.gradient_ratio
         self._updated_at, self._owed = 0, 0.0
+        self._counted_to: int | None = None
         self._resumed: Plain = {}
         self.stop_requested = False
         by_event = config.goal_strategy == "event"
@@ -137,6 +142,10 @@ class FlatSAC(PlainAlgorithm, SAC):
         )
         if reset_num_timesteps:
             self._updated_at, self._owed = 0, 0.0
+        elif self._counted_to is not None:
+            self._updated_at += self.num_timesteps - self._counted_to  # steps that were not done here owe no updates
+        self._counted_to = self.num_timesteps
+        record_settings(self, self.settings)
         if resumed and not resume.set_flat_state(self, self.env, resumed):
             self.close_running_episodes()
         self._guarded = GuardedVecEnv(
@@ -170,6 +179,7 @@ class FlatSAC(PlainAlgorithm, SAC):
             self.learning_starts,
             log_interval,
         )
+        self._counted_to = self.num_timesteps
         return bool(rollout.continue_training)
 
     def _update(self) -> None:
@@ -208,6 +218,18 @@ class FlatSAC(PlainAlgorithm, SAC):
     def learning_state(self) -> Arrays:
         """What learning goes on from besides weights and replay, as plain arrays: random streams, running episodes."""
         return resume.get_flat_state(self)
+
+    @classmethod
+    def load(cls: type[SelfFlatSAC], *args: Any, **kwargs: Any) -> SelfFlatSAC:
+        """Load an agent, see SB3; settings given here replace those that it was saved with.
+
+        :raises SettingError: on an unknown setting or a value that it cannot have
+        """
+        given = {name: value for name, value in kwargs.items() if name in hints(cls.config_class)}
+        checked = read_partial(given, hints(cls.config_class))
+        model = super().load(*args, **kwargs)
+        model.settings = {**model.settings, **checked}
+        return model
 
     def save_replay_buffer(
         self, path: str | pathlib.Path | io.BufferedIOBase, learning_state: Arrays | None = None
@@ -269,7 +291,10 @@ class FlatSAC(PlainAlgorithm, SAC):
                 buffer.truncate_last_trajectory()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_resumed", "stop_requested", "_guarded"]
+        return [
+            *super()._excluded_save_params(),
+            *("_resumed", "stop_requested", "_guarded", "_settings_told_to", "_counted_to"),
+        ]
 
     def _her_buffer(self) -> TerminatingHerReplayBuffer:
         if not isinstance(self.replay_buffer, TerminatingHerReplayBuffer):

@@ -19,11 +19,41 @@ LEVEL_NAMES = ("actor_learning_rate", "batch_size", "buffer_size", "ent_coef", "
 """Settings that Stable-Baselines3 takes for the whole agent, and an agent of two levels for each level."""
 
 
+_UPDATES = "updates follow what was collected; gradient_ratio says how many there are for each environment step"
+_REPLAY = "the replay buffers are the agent's own; buffer_size, n_hindsight_goals and goal_strategy shape them"
+_NOISE = "exploration is that of SAC's stochastic policy"
+OF_SB3_ALONE = {
+    "train_freq": _UPDATES,
+    "gradient_steps": _UPDATES,
+    "target_update_interval": "target critics follow with each update, by tau",
+    "action_noise": _NOISE,
+    "use_sde": _NOISE,
+    "sde_sample_freq": _NOISE,
+    "use_sde_at_warmup": _NOISE,
+    "replay_buffer_class": _REPLAY,
+    "replay_buffer_kwargs": _REPLAY,
+    "optimize_memory_usage": _REPLAY,
+    "n_steps": "returns are of one step",
+}
+"""Arguments of Stable-Baselines3's SAC that there are not here, and what there is."""
+
+
+def check_sb3_names(given: PlainMapping) -> None:
+    """Refuse an argument of Stable-Baselines3 that has no counterpart.
+
+    :raises SettingError: saying what there is in its place
+    """
+    for name in OF_SB3_ALONE:
+        if name in given:
+            raise SettingError(name, f"is not taken: {OF_SB3_ALONE[name]}")
+
+
 def check_top_names(given: PlainMapping) -> None:
-    """Refuse a level's setting that is given for the whole agent.
+    """Refuse a level's setting that is given for the whole agent, and what :func:`check_sb3_names` refuses.
 
     :raises SettingError: naming where it belongs
     """
+    check_sb3_names(given)
     for name in LEVEL_NAMES:
         if name in given:
             raise SettingError(

@@ -162,6 +162,11 @@ class TBCPolicy(BasePolicy):
         raise NonFiniteError(f"low level, step {step}: action {unit[row].tolist()} for inputs {seen[row].tolist()}")
 
     def _as_batch(self, observation: object) -> tuple[Arrays, bool]:
+        if isinstance(observation, tuple):
+            raise ValueError(
+                "predict got a tuple, probably by mixing Gym API and SB3's: an environment's reset returns "
+                "(observation, info), that of a vector the observations alone; pass the observation alone"
+            )
         if not isinstance(observation, dict) or any(key not in observation for key in GOAL_KEYS):
             found = sorted(observation) if isinstance(observation, dict) else type(observation).__name__
             raise ValueError(f"predict needs a goal observation with the keys {sorted(GOAL_KEYS)}, got {found}")

@@ -6,18 +6,22 @@ import contextlib
 import io
 import pathlib
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
-from sb3_tbc.aliases import Plain
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.errors import nearest
 from sb3_tbc.files import save_atomic
+from sb3_tbc.settings import SettingError, Settings, hints
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import named_reset
 from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
+from sb3_tbc.tbc_hrl.calls import device_here
+from sb3_tbc.tbc_hrl.former_settings import LEVEL_NAMES, check_sb3_names
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
 
 SelfPlain = TypeVar("SelfPlain", bound="PlainAlgorithm")
@@ -28,6 +32,9 @@ class PlainAlgorithm(BaseAlgorithm):
 
     SB3's own functions read the file as any other.
     """
+
+    config_class: ClassVar[type[Settings]]
+    """The agent's settings."""
 
     def save(
         self,
@@ -76,6 +83,21 @@ class PlainAlgorithm(BaseAlgorithm):
         return plain
 
     @classmethod
+    def _check_names(cls, given: PlainMapping, data: PlainMapping) -> None:
+        """Refuse what SB3 would take without a word and never use.
+
+        :param given: what loading is to change
+        :param data: what the file holds
+        :raises SettingError: naming the nearest known name
+        """
+        check_sb3_names(given)
+        known = {*data, *hints(cls.config_class), *LEVEL_NAMES, "subgoals"}
+        for name in given:
+            if name not in known:
+                public = (other for other in known if not other.startswith("_"))
+                raise SettingError(name, f"is nothing that loading can change; {nearest(name, public)}")
+
+    @classmethod
     def load(
         cls: type[SelfPlain],
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -98,7 +120,8 @@ class PlainAlgorithm(BaseAlgorithm):
         name = str(path) if isinstance(path, str | pathlib.Path) else "the agent"
         content = read_bytes(path)
         data, given = read_data(content, name), dict(custom_objects or {})
+        cls._check_names(kwargs, data)
         plain = {} if trust else unpickled(data, name, given, env is not None)
         return super().load(
-            io.BytesIO(content), env, device, {**plain, **given}, print_system_info, force_reset, **kwargs
+            io.BytesIO(content), env, device_here(device), {**plain, **given}, print_system_info, force_reset, **kwargs
         )

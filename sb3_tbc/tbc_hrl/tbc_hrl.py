@@ -30,10 +30,17 @@ from sb3_tbc.tbc_hrl import assembly, resume
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
-from sb3_tbc.tbc_hrl.calls import refuse_level_setting, refuse_vec_normalize, whole_steps
+from sb3_tbc.tbc_hrl.calls import explain_level_setting, refuse_level_setting, refuse_vec_normalize, whole_steps
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
-from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics, ProgressBar, described, progress_bar_of, record_progress
+from sb3_tbc.tbc_hrl.diagnostics import (
+    EpisodeDiagnostics,
+    ProgressBar,
+    described,
+    progress_bar_of,
+    record_progress,
+    record_settings,
+)
 from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, reward_range
 from sb3_tbc.tbc_hrl.foreign_high import put_together
 from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
@@ -96,6 +103,7 @@ class TBCHRL(TwoLevelSaving):
         self.reward_range: RewardRange | None = None
         self._n_updates = 0
         self._updated_at = 0
+        self._counted_to: int | None = None
         self._owed: dict[str, float] = {}  # updates still to be done, by level; may be fractions
         self._burst_due = False  # an episode was stored since the last updates
         self.stop_requested = False
@@ -144,6 +152,7 @@ class TBCHRL(TwoLevelSaving):
             """A setting by its name, as ``model.max_options``: short for ``model.config.max_options``."""
             if name in hints(type(self).config_class) and "config" in self.__dict__:
                 return getattr(self.config, name)
+            explain_level_setting(name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
         def __setattr__(self, name: str, value: object) -> None:
@@ -216,6 +225,8 @@ class TBCHRL(TwoLevelSaving):
         if self.subgoals is None:
             self.subgoals = attribute_of(env, "subgoals")
         check_goal_strategy(self.config.goal_strategy, self.subgoals)
+        if self.subgoals is not None:
+            self.subgoals.check_fits(env.observation_space)
         achieved_in_observation = attribute_of(env, "achieved_in_observation")
         self.achieved_in_observation = True if achieved_in_observation is None else bool(achieved_in_observation)
         if self.episode_length is None:
@@ -250,7 +261,7 @@ class TBCHRL(TwoLevelSaving):
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 10,
-        tb_log_name: str = "TBCHRL",
+        tb_log_name: str | None = None,
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> SelfTBCHRL:
@@ -261,6 +272,10 @@ class TBCHRL(TwoLevelSaving):
         only, so the steps of an episode that the end of a call cuts off get their updates in the next call.
 
         Setting :attr:`stop_requested` makes it return between two steps, never in the middle of a burst.
+
+        :param tb_log_name: name of the run for TensorBoard; none: that of the class
+
+        Other parameters are SB3's.
 
         :raises ValueError: without an environment, or if ``total_timesteps`` is negative
         :raises TypeError: if ``total_timesteps`` is not a whole number
@@ -274,10 +289,14 @@ class TBCHRL(TwoLevelSaving):
         planned = total_timesteps + (self.num_timesteps if resumed else 0)
         anew = reset_num_timesteps or self._last_obs is None  # then SB3 resets the environments
         total_timesteps, callback = self._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+            total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         if reset_num_timesteps:
             self._updated_at, self._owed, self._burst_due = 0, {}, False
+        elif self._counted_to is not None:
+            self._updated_at += self.num_timesteps - self._counted_to  # steps that were not done here owe no updates
+        self._counted_to = self.num_timesteps
+        record_settings(self, self.settings)
         collector = self._collect_from(self.env, anew, resumed)
         callback.on_training_start(locals(), globals())
         self._prepare_updates(planned, progress_bar_of(callback))
@@ -337,6 +356,7 @@ class TBCHRL(TwoLevelSaving):
             step = collector.step()
             self._last_obs = step.task_observations  # type: ignore[assignment]
             self.num_timesteps += self.n_envs
+            self._counted_to = self.num_timesteps
             self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
             self._update_info_buffer(step.infos, step.episode_over)
             self._store(step.episodes.values(), collector.env.judge.goal_test)

@@ -62,7 +62,7 @@ class TwoLevelSaving(PlainAlgorithm):
             *super()._excluded_save_params(),
             "high", "low", "config", "rng", "views", "rules", "high_reward", "low_level_reward", "store",
             "diagnostics", "replay_buffer", "schedule", "reachability", "collector", "_resumed",
-            "stop_requested",
+            "stop_requested", "_settings_told_to", "_counted_to",
         ]  # fmt: skip
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

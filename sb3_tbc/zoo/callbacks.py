@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import os
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -19,12 +18,14 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.files import explained, replacing, save_atomic, write_atomic
+from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_text
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+from sb3_tbc.zoo.curves import EvaluationEpisodes
+from sb3_tbc.zoo.rows import RowsCallback
 
 
 class EvaluationRow(NamedTuple):
@@ -90,7 +91,8 @@ class SuccessEvalCallback(EventCallback):
     :param eval_freq: environment steps between evaluations (all environments counted)
     :param n_eval_episodes: episodes per evaluation
     :param seed: evaluation ``k`` runs on seed ``seed + 1000 k``, independently of training
-    :param csv_path: file of the rows, rewritten after each evaluation; rows that are already there are kept
+    :param csv_path: file of the rows, rewritten after each evaluation; rows that are already there are kept. Beside it,
+        as ``.npz``, all episodes are written in the form that SB3's plots read
     :param best_model_path: where the best agent is saved; among equal success rates the one with shorter episodes
     :param wall_time: seconds that earlier parts of a resumed run took
     :param callback_on_new_best: called after a new best was saved
@@ -121,6 +123,8 @@ class SuccessEvalCallback(EventCallback):
         self.best_model_path = best_model_path
         self.callback_on_new_best = callback_on_new_best
         self.rows = read_evaluations(csv_path) if csv_path else []
+        episodes = csv_path.with_suffix(".npz") if csv_path else None
+        self.episodes = EvaluationEpisodes(episodes, {row.timesteps for row in self.rows})
         self._earlier = wall_time
         self._started = time.monotonic()
 
@@ -159,6 +163,7 @@ class SuccessEvalCallback(EventCallback):
             mean_window=finite_mean(result.mean_window),
             wall_time=self.wall_time,
         )
+        self.episodes.add(row.timesteps, result)
         is_best = not self.rows or _quality(row) > max(map(_quality, self.rows))
         self.rows.append(row)
         self._record(row, is_best)
@@ -187,7 +192,7 @@ def _quality(row: EvaluationRow) -> tuple[float, float]:
     return row.success_rate, -row.mean_length
 
 
-class OptionTraceCallback(BaseCallback):
+class OptionTraceCallback(RowsCallback):
     """Writes every option of training to a CSV: step, environment, subgoal, time budget, duration, reason of its end.
 
     :param path: the CSV file; a resumed run keeps its rows up to the step from which it resumes
@@ -197,18 +202,15 @@ class OptionTraceCallback(BaseCallback):
     HEADER = ("timesteps", "env", "time_budget", "duration", "reached", "reason", "episode_over", "subgoal")
 
     def __init__(self, path: Path, every: int = 1, verbose: int = 0) -> None:
-        super().__init__(verbose)
+        super().__init__(path, verbose)
         if every < 1:
             raise ValueError(f"every must be at least 1, got {every}")
-        self.path = path
         self.every = every
         self._seen = 0
-        self._file: io.TextIOWrapper | None = None
 
-    def _on_training_start(self) -> None:
-        keep_trace(self.path, self.HEADER, self.num_timesteps)
-        with explained(self.path):
-            self._file = self.path.open("a", encoding="utf-8", newline="")
+    def head(self) -> str:
+        """The names of the columns."""
+        return ",".join(self.HEADER) + "\n"
 
     def _on_step(self) -> bool:
         for index, info in enumerate(self.locals.get("infos", ())):
@@ -217,42 +219,13 @@ class OptionTraceCallback(BaseCallback):
                 continue
             self._seen += 1
             if self._seen % self.every == 0:
-                self._write(index, option, index in self.locals.get("episodes", {}))
+                self._note(index, option, index in self.locals.get("episodes", {}))
         return True
 
-    def _write(self, index: int, option: Plain, episode_over: bool) -> None:
-        if self._file is None:
-            return
+    def _note(self, index: int, option: Plain, episode_over: bool) -> None:
         subgoal = " ".join(f"{x:.4g}" for x in option["subgoal"])
-        row = [self.num_timesteps, index, f"{option['time_budget']:.4g}", option["duration"]]
-        row += [int(option["reached"]), option["reason"], int(episode_over), subgoal]
-        with explained(self.path):
-            csv.writer(self._file, lineterminator="\n").writerow(row)
-
-    def flush(self) -> None:
-        """Put what was written on the disk, so that a checkpoint never has more steps than the trace."""
-        if self._file is not None:
-            with explained(self.path):
-                self._file.flush()
-                os.fsync(self._file.fileno())
-
-    def _on_training_end(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
-
-
-def keep_trace(path: Path, header: tuple[str, ...], timesteps: int) -> None:
-    """Keep the complete lines of a trace up to a step; create the file if there is none."""
-    with replacing(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as kept:
-        csv.writer(kept, lineterminator="\n").writerow(header)
-        if not timesteps or not path.is_file():
-            return
-        with path.open(encoding="utf-8", errors="replace", newline="") as earlier:
-            for line in earlier:
-                steps = line.partition(",")[0]
-                if line.endswith("\n") and steps.isdecimal() and int(steps) <= timesteps:
-                    kept.write(line)
+        row = [index, f"{option['time_budget']:.4g}", option["duration"]]
+        self.write([*row, int(option["reached"]), option["reason"], int(episode_over), subgoal])
 
 
 class StopTraining(Exception):

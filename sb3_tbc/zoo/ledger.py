@@ -25,6 +25,7 @@ from sb3_tbc.reading import read_json, read_yaml
 from sb3_tbc.stats import stability, wilson_interval
 from sb3_tbc.zoo.callbacks import EvaluationRow, finite_mean, read_evaluations, write_evaluations
 from sb3_tbc.zoo.checkpoints import NEWEST, has_checkpoint, remove_checkpoints, remove_unfinished
+from sb3_tbc.zoo.curves import EVALUATION_EPISODES, MONITOR
 
 CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL = (
     "config.yml",
@@ -206,7 +207,8 @@ class RunFolder:
             (self.path / name).unlink(missing_ok=True)
         remove_checkpoints(self.path)
         self.tidy()
-        rest = (COMMAND, VERSIONS, EVALUATIONS, self.model.name, self.best_model.name, "progress.csv", "options.csv")
+        rest = (COMMAND, VERSIONS, EVALUATIONS, EVALUATION_EPISODES, MONITOR, self.model.name, self.best_model.name,
+                "progress.csv", "options.csv")  # fmt: skip
         for path in (*(self.path / name for name in rest), *self.path.glob("*_until_*")):
             remove(path)
 

@@ -28,8 +28,10 @@ from sb3_tbc.zoo.algorithms import RUN_INFO, Agent, build_model, load_model, rea
 from sb3_tbc.zoo.callbacks import OptionTraceCallback, StopTraining, SuccessEvalCallback, TimedCheckpointCallback
 from sb3_tbc.zoo.checkpoints import find_checkpoint, keep_only, remove_checkpoints, save_checkpoint
 from sb3_tbc.zoo.config import RunConfig
+from sb3_tbc.zoo.curves import MONITOR, TrainingMonitor
 from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise
+from sb3_tbc.zoo.rows import RowsCallback
 from sb3_tbc.zoo.safety import CURE, ConsistentState, DivergenceCallback, check_weights
 
 
@@ -276,7 +278,9 @@ class Training:
     ) -> None:
         self.model, self.spec, self.folder, self.options = model, spec, folder, options
         self.earlier, self.after_eval = earlier, after_eval
-        self.trace = OptionTraceCallback(folder.path / "options.csv") if options.trace else None
+        self.written: list[RowsCallback] = [TrainingMonitor(folder.path / MONITOR, spec.env_id, earlier)]
+        if options.trace:
+            self.written.append(OptionTraceCallback(folder.path / "options.csv"))
         self.consistent = ConsistentState()
 
     def run(self) -> Plain:
@@ -311,8 +315,8 @@ class Training:
     def checkpoint(self, save_replay: Callable[[Path], object] | None = None) -> None:
         """Save everything that is needed to resume the run."""
         check_weights(self.model)
-        if self.trace is not None:
-            self.trace.flush()
+        for file in self.written:
+            file.flush()
         steps, replay = int(self.model.num_timesteps), save_replay or self.model.save_replay_buffer
         save_checkpoint(self.folder.path, steps, self.evaluations.wall_time, self.model.save, replay)
 
@@ -324,7 +328,7 @@ class Training:
             self.evaluations,
             TimedCheckpointCallback(self.checkpoint, options.checkpoint_seconds, lambda: bool(options.stop)),
             self.consistent,
-            *([self.trace] if self.trace else []),
+            *self.written,
         ]
         left, fresh = wanted - self.model.num_timesteps, self.model.num_timesteps == 0
         try:
