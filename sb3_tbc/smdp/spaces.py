@@ -116,7 +116,7 @@ class SubgoalSpace:
         self.rotations = tuple(rotations)
         self._check()
 
-    def __reduce__(self) -> tuple[object, ...]:  # type: ignore[override]
+    def __reduce__(self) -> tuple[object, ...]:
         """Travel to other processes whatever the maps are: functions without a name of their own go by value."""
         try:
             pickle.dumps((self._achieved, self._local))

@@ -104,16 +104,21 @@ def register() -> None:
         manager.ExperimentManager.read_hyperparameters = _reading_ours(reading)
 
 
-def _reading_ours(reading: Callable[[Any], object]) -> Callable[[Any], object]:
+def _reading_ours(reading: Callable[[Any], tuple[Plain, Plain]]) -> Callable[[Any], tuple[Plain, Plain]]:
     """The zoo's way of reading configurations, told where ours are."""
 
-    def read_hyperparameters(self: Any) -> object:
-        if self.algo in IN_ZOO and self.config.endswith(f"hyperparams/{self.algo}.yml"):  # the zoo's, which has none
+    def read_hyperparameters(self: Any) -> tuple[Plain, Plain]:
+        if self.algo not in IN_ZOO:
+            return reading(self)
+        if self.config.endswith(f"hyperparams/{self.algo}.yml"):  # the zoo's own, which there is none of
             module = types.ModuleType(f"{__name__}.{self.algo}")  # it also reads modules
             module.hyperparams = zoo_settings(self.algo)  # type: ignore[attr-defined]
             sys.modules[module.__name__] = module
             self.config = module.__name__
-        return reading(self)
+        settings = reading(self)
+        if not self.eval_env_kwargs:  # the zoo gives them to training alone
+            self.eval_env_kwargs = dict(settings[0].get("env_kwargs", {}))
+        return settings
 
     read_hyperparameters.reads_ours = True  # type: ignore[attr-defined]
     return read_hyperparameters

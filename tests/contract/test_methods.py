@@ -131,8 +131,8 @@ def test_settings_change_while_loading(algo: str, tmp_path: Path) -> None:
 @every_algorithm
 def test_loading_takes_nothing_that_it_does_not_know(algo: str, tmp_path: Path) -> None:
     make(algo).save(tmp_path / "a.zip")
-    with pytest.raises(ValueError, match="gama is nothing that loading can change; did you mean"):
-        ALGORITHMS[algo].load(tmp_path / "a.zip", env=corridor(), gama=0.9)
+    with pytest.raises(ValueError, match="gradient_rate is nothing that loading can change; did you mean"):
+        ALGORITHMS[algo].load(tmp_path / "a.zip", env=corridor(), gradient_rate=0.9)
     with pytest.raises(ValueError, match="belongs to a level" if algo != "sac" else "gamma must be a number"):
         ALGORITHMS[algo].load(tmp_path / "a.zip", env=corridor(), gamma=1.9)
 

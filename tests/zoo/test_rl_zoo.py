@@ -17,7 +17,7 @@ from sb3_tbc.extras import MissingExtraError
 from sb3_tbc.zoo.rl_zoo import IN_ZOO, nested, with_subgoals, zoo_settings
 
 TASK = "sb3_tbc/Drawbridge-v0"
-SMALL = ["low.batch_size:16", "high.batch_size:16", "gradient_ratio:0.02", "compile:False", "max_options:5"]
+SMALL = ["low.batch_size:16", "high.batch_size:16", "gradient_ratio:0.02", "compile:False", "max_options:5", "dt_min:0"]
 
 
 def test_dotted_names_are_sections() -> None:
@@ -49,6 +49,7 @@ def trained(monkeypatch: pytest.MonkeyPatch, algo: str, folder: Path, *more: str
     command(
         monkeypatch, "train", "--algo", algo, "--env", TASK, "-n", "700", "--eval-freq", "350", "--eval-episodes", "2",
         "-f", str(folder), "--seed", "1", "--save-replay-buffer", *more, "-params", *SMALL,
+        "--env-kwargs", "max_episode_steps:100",
     )  # fmt: skip
     return max((folder / algo).glob("*Drawbridge-v0_*"))
 
@@ -81,7 +82,19 @@ def test_trains_continues_and_enjoys(algo: str, tmp_path: Path, monkeypatch: Any
 def test_optimises(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     pytest.importorskip("rl_zoo3")
     sb3_tbc.zoo.register()
-    trained(monkeypatch, "hits", tmp_path, "-optimize", "--n-trials", "1", "--n-evaluations", "1", "--no-optim-plots")
+    trained(
+        monkeypatch,
+        "hits",
+        tmp_path,
+        "-optimize",
+        "--n-trials",
+        "1",
+        "--n-evaluations",
+        "1",
+        "--pruner",
+        "none",
+        "--no-optim-plots",
+    )
     out = capsys.readouterr().out
     assert "Number of finished trials:  1" in out
     assert "low.learning_rate" in out
