@@ -43,12 +43,12 @@ def shows(verdict: str, *rows: str) -> Callable[[Test], Test]:
 
 
 def table_rows() -> list[str]:
-    """The rows of all tables of the page, as ``"what: verdict"``."""
+    """The rows of all tables of the page, as ``"what: verdict"``, but for those that name a test file of their own."""
     rows = []
     for line in PAGE.read_text(encoding="utf-8").splitlines():
         cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
         verdict = re.match(r"yes|refused|not applicable", cells[1]) if len(cells) == 3 else None
-        if verdict and line.startswith("|"):
+        if verdict and line.startswith("|") and not cells[2].startswith("`tests/"):
             rows += [f"{name}: {verdict[0]}" for name in re.findall(r"`([^`]+)`", cells[0])]
     return rows
 

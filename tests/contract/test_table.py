@@ -37,6 +37,11 @@ def test_every_test_has_its_row(rows: list[str]) -> None:
     assert set(SHOWN) - set(rows) == set()
 
 
+def test_test_files_that_rows_name_exist() -> None:
+    for name in re.findall(r"\| `(tests/\S+?)` \|", PAGE.read_text(encoding="utf-8")):
+        assert (PAGE.parents[1] / name).is_file(), name
+
+
 def named() -> str:
     """All names in the first columns."""
     return " ".join(row.rpartition(":")[0] for row in table_rows())

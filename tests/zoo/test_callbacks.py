@@ -56,7 +56,7 @@ def evaluation(rates: list[float], calls: list[int]) -> Any:
         calls.append(seed)
         successes = np.arange(n) < round(rate * n)
         fields = dict.fromkeys(("subgoal_success", "mean_window"), np.ones(n))
-        return SimpleNamespace(successes=successes, lengths=np.full(n, 100), **fields)
+        return SimpleNamespace(successes=successes, lengths=np.full(n, 100), rewards=np.full(n, -1.0), **fields)
 
     return evaluate
 
