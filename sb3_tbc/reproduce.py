@@ -21,7 +21,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
 from sb3_tbc.train import variant_name
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
-from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, load_config, parse_overrides
+from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, ablations_of, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env, task_names
 from sb3_tbc.zoo.ledger import RunFolder
 
@@ -29,6 +29,7 @@ EXAMPLES = {
     "sb3_tbc.reproduce --dry-run": "what would run, and how many hours it takes",
     "sb3_tbc.reproduce --tasks Pendulum --seeds 3 --workers 2": "three seeds of every method, two runs at a time",
     "sb3_tbc.reproduce --algos tbc-hrl --ablation no-ts --first-seed 100": "an ablation, on fresh seeds",
+    "sb3_tbc.reproduce --tasks Pendulum UR5Reacher --algos tbc-hrl --ablations --seeds 3": "what each part is worth",
     "sb3_tbc.reproduce --executor slurm --workers 40 --slurm slurm_partition:short": "as jobs of Slurm",
     "sb3_tbc.reproduce --executor ray --workers 40 --address auto": "on the Ray cluster that this machine belongs to",
 }
@@ -48,6 +49,8 @@ def build_parser() -> Parser:
         help="which values to use; by default tuned, for tasks that have them",
     )
     add("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
+    add("--ablations", action="store_true", help="every ablation that changes something in a task's settings; "
+        "needs --algos tbc-hrl")  # fmt: skip
     add("--variant", help="name of the runs' folder; by default from --config and --ablation")
     add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as in sb3_tbc.train")
     add("--n-timesteps", type=positive_int, help="environment steps of each run; by default the task's")
@@ -74,25 +77,34 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
     """
     args = build_parser().parse_args(argv)
     overrides = parse_overrides(args.hyperparams)
+    if args.ablations and (args.ablation or args.variant):
+        raise ConfigError("--ablations names the runs' folders itself: leave --ablation and --variant out")
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         for name in args.tasks:
             task, _ = resolve_env(name)
             for algo in (name.lower() for name in args.algos):
                 algorithm(algo)
-                run = load_config(algo, task, args.config, overrides, args.ablation)
-                variant = args.variant or variant_name(args.ablation, args.config)
-                arguments = ["--algo", algo, "--env", name, "--seed", str(seed), "--variant", variant, *_shared(args)]
-                folder, target = (
-                    RunFolder.for_run(root.absolute(), task, algo, variant, seed)
-                    for root in (args.log_folder, args.ledger)
-                )
-                yield Job(algo, name, seed, folder, target, tuple(arguments), args.n_timesteps or run.n_timesteps)
+                for ablation in ablations_of(task, args.config) if args.ablations else [args.ablation]:
+                    run = load_config(algo, task, args.config, overrides, ablation)
+                    steps = args.n_timesteps or run.n_timesteps
+                    yield _job(args, algo, name, seed, ablation, steps)
+
+
+def _job(args: argparse.Namespace, algo: str, env: str, seed: int, ablation: str | None, n_timesteps: int) -> Job:
+    task, _ = resolve_env(env)
+    variant = args.variant or variant_name(ablation, args.config)
+    arguments = ["--algo", algo, "--env", env, "--seed", str(seed), "--variant", variant, *_shared(args)]
+    arguments += ["--ablation", ablation] if ablation else []
+    folder, target = (
+        RunFolder.for_run(root.absolute(), task, algo, variant, seed) for root in (args.log_folder, args.ledger)
+    )
+    return Job(algo, env, seed, folder, target, tuple(arguments), n_timesteps)
 
 
 def _shared(args: argparse.Namespace) -> list[str]:
     """Arguments of the training command that are the same for all runs."""
     shared = ["--log-folder", str(args.log_folder), "--n-final-episodes", str(args.n_final_episodes)]
-    names = ("config", "n_timesteps", "ablation", "eval_freq", "n_eval_episodes")
+    names = ("config", "n_timesteps", "eval_freq", "n_eval_episodes")
     for name, value in ((name, getattr(args, name)) for name in names):
         shared += [f"--{name.replace('_', '-')}", str(value)] if value else []
     return [*shared, "--hyperparams", *args.hyperparams] if args.hyperparams else shared

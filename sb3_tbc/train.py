@@ -19,7 +19,7 @@ from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm
-from sb3_tbc.zoo.config import CONFIGS, load_config, parse_overrides
+from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
@@ -51,7 +51,9 @@ def build_parser() -> Parser:
                       "with sections like those of zoo_configs")  # fmt: skip
     what.add_argument("--config-file", type=Path, metavar="FILE.yml", help="a configuration file of your own; --config "
                       "says which of its values to use, paper or tuned")  # fmt: skip
-    what.add_argument("--ablation", help="leave a part out: no-ts (timed subgoals) or no-ndbc (the circuit)")
+    what.add_argument(
+        "--ablation", metavar="NAME", help=f"leave a part of the method out, or put one in: {', '.join(ABLATIONS)}"
+    )
     what.add_argument("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, which win "
                       "over the configuration; dots lead into a level, e.g. low.learning_rate:1e-3")  # fmt: skip
     what.add_argument("--on-bad-step", choices=["stop", "end-episode"], help="what follows where the environment "

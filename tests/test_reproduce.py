@@ -35,6 +35,19 @@ def test_ablations_have_folders_of_their_own(tmp_path: Path) -> None:
     assert "--ablation no-ts" in " ".join(job.command())
 
 
+def test_all_ablations_in_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    planned = list(reproduce.jobs(campaign(tmp_path, "--algos", "tbc-hrl", "--ablations", "--seeds", "1")))
+    names = [job.target.path.parent.name for job in planned]
+    assert len(set(names)) == len(names) == 11
+    assert {"no-ts", "with-memory", "with-early-end", "no-smdp"} <= set(names)
+    for job, name in zip(planned, names, strict=True):
+        assert f"--ablation {name}" in " ".join(job.command())
+    assert reproduce.main(campaign(tmp_path, "--ablations")) == 2
+    assert "only tbc-hrl has ablations" in capsys.readouterr().err
+    assert reproduce.main(campaign(tmp_path, "--ablations", "--variant", "mine")) == 2
+    assert "leave --ablation and --variant out" in capsys.readouterr().err
+
+
 def test_finished_runs_are_not_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     done = RunFolder.for_run(tmp_path / "results", "Pendulum", "hits", "full", 0)
     done.path.mkdir(parents=True)

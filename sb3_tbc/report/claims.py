@@ -38,6 +38,7 @@ def _of_row(text: str, row: Row) -> Claim:
     p_value = "no test" if row.test.p_holm is None else f"p (Holm) {row.test.p_holm:.3g}"
     low, high = row.interval.low, row.interval.high
     evidence = f"{row.test.difference:+.3f} ({low:+.3f} to {high:+.3f}) against {row.other}; {p_value}"
+    evidence += f"; unequal {'; '.join(row.unequal)}" if row.unequal else ""
     return Claim(text, row.task, verdict(row.test.difference, row.test), evidence)
 
 

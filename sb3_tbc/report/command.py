@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sb3_tbc.commands import Parser, run_command
 from sb3_tbc.files import write_atomic
+from sb3_tbc.report.departures import departures_table
 from sb3_tbc.report.markdown import curves_csv, to_markdown, update_page
 from sb3_tbc.report.measured import measured_yaml
 from sb3_tbc.report.page import to_html
@@ -41,19 +42,19 @@ def command(argv: Sequence[str]) -> int:
     args = build_parser().parse_args(argv)
     results = load_results(args.results)
     descriptions, paper, failed = load_descriptions(args.results), load_paper(), failed_runs(args.results)
-    missing = missing_table(args.results, results)
+    missing, departed = missing_table(args.results, results), departures_table(args.results, results)
     print("\n\n".join(f"{title}\n\n{to_text(table)}" for title, table in all_tables(results).items()))
     print(f"\n{NOTES}")
     if failed:
         print("\n" + "\n".join(f"failed         {path}" for path in failed))
     if args.update is not None:
-        update_page(args.update, to_markdown(results, descriptions, paper, missing))
+        update_page(args.update, to_markdown(results, descriptions, paper, missing, departed))
     if args.curves is not None:
         write_atomic(args.curves, curves_csv(results))
     if args.measured is not None:
         write_atomic(args.measured, measured_yaml(results))
     if args.html is not None:
-        write_atomic(args.html, to_html(results, descriptions, paper, failed, missing, args.html))
+        write_atomic(args.html, to_html(results, descriptions, paper, failed, missing, departed, args.html))
         print(f"\nreport         {args.html}")
     return 0
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_tbc import stats
+from sb3_tbc.report.conditions import differences
 from sb3_tbc.report.runs import OURS, Results, Run, is_shipped, on_union_of_steps, shipped, successes
 from sb3_tbc.zoo.config import ABLATIONS
 
@@ -47,6 +48,7 @@ class Row(NamedTuple):
     test: stats.Comparison
     gain: Gain | None
     strongest: bool
+    unequal: tuple[str, ...] = ()  # conditions in which the other row differs, our value in brackets
 
 
 def interval_of(runs: Sequence[Run]) -> stats.Interval:
@@ -136,7 +138,8 @@ def _rows(results: Results, others: Mapping[str, Sequence[str]]) -> list[Row]:
         ours, theirs = results[task][OURS], results[task][name]
         gain = convergence_gain(ours, theirs, common_threshold(results[task]))
         strongest = name in strongest_baselines(results[task])
-        rows.append(Row(task, name, difference_of(ours, theirs), tests[task, name], gain, strongest))
+        unequal = tuple(differences(theirs, ours))
+        rows.append(Row(task, name, difference_of(ours, theirs), tests[task, name], gain, strongest, unequal))
     return rows
 
 

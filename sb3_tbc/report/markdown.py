@@ -19,7 +19,11 @@ MARKS = ("<!-- results:begin -->", "<!-- results:end -->")
 
 
 def to_markdown(
-    results: Results, descriptions: Mapping[str, Mapping[str, str]], paper: Paper, missing: tables.Table
+    results: Results,
+    descriptions: Mapping[str, Mapping[str, str]],
+    paper: Paper,
+    missing: tables.Table,
+    departed: tables.Table,
 ) -> str:
     """All tables, with descriptions of the rows and the planned runs that are missing; empty tables are left out."""
     sections = [
@@ -32,6 +36,7 @@ def to_markdown(
             tables.conditions_table(results),
             "Baselines that differ from our row in what should be the same; our value in brackets.",
         ),
+        ("Where the shipped agent departs from the paper", departed, tables.DEPARTURE_NOTES),
         ("All tasks together", tables.overall_table(results), "Shipped settings; seeds are resampled within tasks."),
         ("All rows", tables.success_table(results), tables.NOTES),
         ("Planned and missing", missing, "Planned runs that are not in the ledger, and the command that makes them."),

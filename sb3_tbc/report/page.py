@@ -16,7 +16,18 @@ from sb3_tbc.report.paper import Figure, Paper
 from sb3_tbc.report.runs import Results, Run, describe, is_shipped
 from sb3_tbc.report.timeline import TRACE, last_episode, option_timeline
 
-TEXT_COLUMNS = ("what it is", "notes", "note", "differs from ours in", "evidence", "machine", "verdict", "command")
+TEXT_COLUMNS = (
+    "what it is",
+    "notes",
+    "note",
+    "differs from ours in",
+    "evidence",
+    "machine",
+    "verdict",
+    "command",
+    "what it is worth",
+    "tasks",
+)
 INTRODUCTION = (
     "Rows without a further name have the shipped settings. Lines are means over seeds, bands their 95 % bootstrap "
     "intervals, dots every measured evaluation. Point at a curve to read its values, at a name to highlight its curve."
@@ -29,6 +40,7 @@ def to_html(
     paper: Paper,
     failed: Sequence[Path],
     missing: Sequence[Sequence[str]],
+    departed: Sequence[Sequence[str]],
     out: Path,
 ) -> str:
     """The whole page.
@@ -38,6 +50,7 @@ def to_html(
     :param paper: the paper's figures
     :param failed: folders of runs that ended in an error
     :param missing: table of planned runs that the ledger lacks
+    :param departed: table of what the shipped agent departs from the paper in
     :param out: path of the page, for links to films
     """
     style, script = (_template(name) for name in ("page.css", "page.js"))
@@ -52,6 +65,7 @@ def to_html(
         *_section("Against our own ablations", tables.comparison_table(against_ablations(results)), ""),
         *_section("Which of the paper's claims hold here", claims_table(results), ""),
         *_section("Not run under equal conditions", tables.conditions_table(results), "Our value in brackets."),
+        *_section("Where the shipped agent departs from the paper", departed, tables.DEPARTURE_NOTES),
         *_section(
             "All tasks together", tables.overall_table(results), "Shipped settings; seeds resampled within tasks."
         ),

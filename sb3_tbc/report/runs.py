@@ -103,7 +103,7 @@ def load_results(root: Path) -> Results:
             raise ConfigError(f"cannot read the run in {folder.path}: {error}") from error
     if not results:
         raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
-    tuned = _read_table(root / TUNING_SEEDS)
+    tuned = read_table(root / TUNING_SEEDS)
     return {
         task: {m: _reported(methods[m], tuned.get(task, {}).get(m, ())) for m in sorted(methods, key=_rank)}
         for task, methods in sorted(results.items())
@@ -163,10 +163,10 @@ def load_descriptions(root: Path) -> dict[str, dict[str, str]]:
 
     :raises ConfigError: if the file cannot be read
     """
-    return {task: {k: str(v) for k, v in lines.items()} for task, lines in _read_table(root / DESCRIPTIONS).items()}
+    return {task: {k: str(v) for k, v in lines.items()} for task, lines in read_table(root / DESCRIPTIONS).items()}
 
 
-def _read_table(path: Path) -> dict[str, Plain]:
+def read_table(path: Path) -> dict[str, Plain]:
     """Read a YAML file of two levels; empty if there is no such file.
 
     :raises ConfigError: if it cannot be read

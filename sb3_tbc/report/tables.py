@@ -28,6 +28,10 @@ NOTES = (
     "share of evaluations at 0.9 or more from then on, mean over seeds. Worst: the lowest of these evaluations, of "
     "all seeds."
 )
+DEPARTURE_NOTES = (
+    "Settings of tbc-hrl that differ between --config paper (its tables and text) and --config tuned (shipped). "
+    "What it is worth: success of the shipped agent minus that of a row with the paper's value, with its 95 % interval."
+)
 COMPARISON_NOTES = (
     "Difference: ours minus theirs, with its 95 % interval. p: Welch's test on seeds, two-sided; (Holm): corrected "
     "over all tests of the table; * below 0.05, ** below 0.01. There is no test with fewer than three seeds on a "
@@ -95,7 +99,8 @@ def comparison_table(rows: Sequence[Row]) -> Table:
         effects = [f"{test.cliffs_delta:+.2f}", f"{test.improvement:.2f}"] if over_seeds else ["-", "-"]
         gain = "-" if row.gain is None else str(row.gain)
         interval = f"{row.interval.low:+.3f} to {row.interval.high:+.3f}"
-        note = ", ".join(filter(None, [test.note, "strongest baseline" if row.strongest else ""]))
+        unequal = f"unequal {'; '.join(row.unequal)}" if row.unequal else ""
+        note = ", ".join(filter(None, [test.note, "strongest baseline" if row.strongest else "", unequal]))
         numbers = [f"{test.difference:+.3f}", *tested, test.mark, effects[0], gain, interval, effects[1]]
         table.append([row.task, row.other, *numbers, note])
     return table

@@ -11,21 +11,47 @@ from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import MAX_DEPTH, parse_yaml, read_yaml
+from sb3_tbc.tbc_hrl.config import TBCConfig
 from sb3_tbc.zoo.schema import RUN, coerce, validate
 
 CONFIGS = ("paper", "tuned")
 OTHER = "other"
 """Section of configuration files for environments that have none of their own."""
+PARTS: dict[str, tuple[Plain, Plain]] = {
+    "duration-loss": ({"duration": "joint", "duration_loss_coef": 1.0}, {"duration_loss_coef": 0.0}),
+    "rule": ({"duration": "rule", "duration_loss_coef": 0.0}, {"duration": "joint"}),
+    "memory": ({"memory": "window", "sequence_length": 4}, {"memory": "none", "sequence_length": 1}),
+    "early-end": ({"window_end": "reached"}, {"window_end": "timed"}),
+    "smdp": ({"target": "smdp"}, {"target": "decision", "completion_bonus": 0.0}),
+    "normalised-critics": (
+        {"high": {"critic_norm": "batch"}, "low": {"critic_norm": "batch"}},
+        {"high": {"critic_norm": "none"}, "low": {"critic_norm": "none"}},
+    ),
+    "originals": ({"keep_original": True}, {"keep_original": False}),
+    "deterministic-testing": ({"deterministic_testing": True}, {"deterministic_testing": False}),
+    "dense-reward": ({"low_reward": "dense"}, {"low_reward": "sparse"}),
+}
+"""Part of the paper's method -> the settings with it, and those without it.
+
+The paper normalises the states that critics see; the nearest setting normalises the input of every layer of theirs.
+"""
 ABLATIONS: dict[str, Plain] = {
-    "no-ts": {"duration": "fixed", "remaining_time": False, "target": "decision", "duration_loss_coef": 0.0},
+    "no-ts": {
+        "duration": "fixed",
+        "remaining_time": False,
+        "target": "decision",
+        "duration_loss_coef": 0.0,
+        "completion_bonus": 0.0,
+    },
     "no-ndbc": {"low": {"policy_kwargs": {"ndbc": None}}, "sequence_length": 1},
+    **{f"with-{part}": settings for part, (settings, _) in PARTS.items()},
+    **{f"no-{part}": settings for part, (_, settings) in PARTS.items()},
 }
 """Ablation name -> what it overrides, merged after the task's section.
 
-``no-ts`` removes timed scheduling: windows have a constant length (``dt_max``), the low level does not see the
-remaining time, and a decision is discounted by a constant instead of ``gamma ** tau``.
-``no-ndbc`` gives the low level an MLP. Both keep the full model's number of parameters, see
-:mod:`sb3_tbc.zoo.ablations`.
+``no-ts`` takes timed scheduling out: windows of a constant length (``dt_max``), no remaining time for the low level to
+see, one discount per decision in place of ``gamma ** tau``. ``no-ndbc`` gives the low level an MLP. The others put one
+of :data:`PARTS` in or leave it out. All keep the full model's number of parameters, see :mod:`sb3_tbc.zoo.ablations`.
 """
 
 
@@ -175,3 +201,16 @@ def load_config(
             "one as a whole, so start from a copy of that"
         )
     return RunConfig(algo=algo, task=task, config=config, model=merged, **run)
+
+
+def ablations_of(task: str, config: str | None = None) -> list[str]:
+    """The ablations that change something in the configuration of a task.
+
+    :param config: ``paper`` or ``tuned``, as :func:`load_config` takes it
+    """
+
+    def settings(ablation: str | None = None) -> TBCConfig:
+        model = load_config("tbc-hrl", task, config, ablation=ablation).model
+        return TBCConfig.from_dict({name: value for name, value in model.items() if name != "policy"})
+
+    return [name for name in ABLATIONS if settings(name) != settings()]

@@ -23,6 +23,7 @@ from sb3_tbc.report.comparisons import (
     strongest_baselines,
 )
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
+from sb3_tbc.report.departures import departures_of, departures_table
 from sb3_tbc.report.paper import load_paper
 from sb3_tbc.report.planned import missing_table
 from sb3_tbc.report.runs import Curve, describe, load_descriptions, load_results, on_union_of_steps
@@ -172,6 +173,45 @@ def test_unequal_conditions_are_named(tmp_path: Path) -> None:
         }
     }
     assert tables.conditions_table(results)[1][:2] == ["A", "hits"]
+
+
+def test_comparisons_say_what_is_unequal_in_ablations_too(tmp_path: Path) -> None:
+    for seed in range(3):
+        fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 0.9 + seed / 100)
+        fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 0.4, variant="no-ts", config={"n_timesteps": 1000})
+    results = load_results(tmp_path)
+    (row,) = against_ablations(results)
+    assert row.unequal == ("training steps: 1,000 (4,000)",)
+    assert tables.comparison_table([row])[1][-1] == "unequal training steps: 1,000 (4,000)"
+    (claim,) = [c for c in claims(results) if "timed subgoals" in c.text]
+    assert claim.evidence.endswith("unequal training steps: 1,000 (4,000)")
+
+
+def test_departures_from_the_paper_come_with_their_measurement(tmp_path: Path) -> None:
+    for seed in range(3):
+        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 0.9)
+        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 0.6, variant="with-memory", config={"n_timesteps": 1000})
+        fake_run(tmp_path, "UR5Reacher", "tbc-hrl", seed, 0.9)
+    (tmp_path / "measurements.yml").write_text("default: {tbc-hrl with-memory: [memory]}")
+    header, *rows = departures_table(tmp_path, load_results(tmp_path))
+    cells = {(row[0], row[3]): dict(zip(header, row, strict=True)) for row in rows}
+    memory = cells["memory", "all"]
+    assert (memory["paper"], memory["shipped"]) == ("window", "none")
+    assert memory["what it is worth"].startswith("Pendulum: +0.300 (")
+    assert memory["what it is worth"].endswith("which differs in training steps: 1,000 (4,000)")
+    assert cells["window_end", "all"]["what it is worth"] == "not measured"
+    assert cells["max_options", "UR5Reacher"]["paper"] == "24"
+    assert not [row for row in rows if row[1] == row[2]]
+    assert not [row for row in rows if row[0] == "kappa"]  # the same in both
+
+
+def test_measurements_name_departures_that_there_are() -> None:
+    """Nothing is said to measure a setting that the shipped agent does not depart in."""
+    table = yaml.safe_load((ROOT / "results" / "measurements.yml").read_text())
+    everywhere = {name for task in load_results(ROOT / "results") for name in departures_of(task)}
+    for task, rows in table.items():
+        allowed = everywhere if task == "default" else set(departures_of(task))
+        assert not [(row, name) for row, names in rows.items() for name in names if name not in allowed]
 
 
 def test_rows_say_which_seeds_are_from_uncommitted_code(tmp_path: Path) -> None:

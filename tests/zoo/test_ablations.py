@@ -8,7 +8,7 @@ import pytest
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.zoo.ablations import match_parameters, mlp_parameters, parameter_count
 from sb3_tbc.zoo.algorithms import build_model
-from sb3_tbc.zoo.config import ABLATIONS, config_file, load_config, read_file
+from sb3_tbc.zoo.config import ABLATIONS, PARTS, ablations_of, config_file, load_config, read_file
 from sb3_tbc.zoo.environments import make_envs, task_names
 
 TASKS = sorted(set(read_file(config_file("tbc-hrl"))) - {"default", "other"})
@@ -19,7 +19,7 @@ def test_mlp_parameters() -> None:
     assert mlp_parameters([3]) == 0
 
 
-@pytest.mark.parametrize("ablation", sorted(ABLATIONS))
+@pytest.mark.parametrize("ablation", ["no-ndbc", "no-ts"])
 @pytest.mark.parametrize("task", TASKS)
 def test_parameters_match_within_half_a_percent(task: str, ablation: str) -> None:
     env_id = task_names()[task]
@@ -50,3 +50,17 @@ def test_ablations_are_of_the_full_method() -> None:
         load_config("tbc-hrl", "Pendulum", ablation="no-ndcb")
     with pytest.raises(ConfigError, match="only tbc-hrl has ablations"):
         load_config("hits", "Pendulum", ablation="no-ts")
+
+
+@pytest.mark.parametrize("config", ["paper", "tuned"])
+@pytest.mark.parametrize("task", ["Pendulum", "UR5Reacher"])
+def test_every_part_of_the_paper_is_one_ablation(task: str, config: str) -> None:
+    """Each part is either in the configuration, then it can be left out, or it is not, then it can be put in."""
+    found = ablations_of(task, config)
+    assert {"no-ts", "no-ndbc"} <= set(found)
+    for part in PARTS:
+        (name,) = {f"with-{part}", f"no-{part}"} & set(found)
+        full = load_config("tbc-hrl", task, config)
+        matched = match_parameters(load_config("tbc-hrl", task, config, ablation=name), full, task_names()[task])
+        assert abs(matched.ablated / matched.full - 1) <= 0.005
+    assert set(found) < set(ABLATIONS)

@@ -1,0 +1,96 @@
+"""In what the shipped agent departs from the paper, setting by setting, and what each departure is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from sb3_tbc.aliases import PlainMapping
+from sb3_tbc.report.comparisons import difference_of
+from sb3_tbc.report.conditions import differences
+from sb3_tbc.report.runs import OURS, Results, read_table
+from sb3_tbc.zoo.config import load_config
+
+MEASUREMENTS = "measurements.yml"
+"""In the folder of results: task -> row -> settings of the shipped agent that the row has at the paper's value; under
+``default``: rows of all tasks."""
+NOT_MEASURED = "not measured"
+
+
+class Departure(NamedTuple):
+    """A setting that differs, where, and what measurements say."""
+
+    setting: str
+    paper: str
+    shipped: str
+    tasks: tuple[str, ...]
+    measured: tuple[str, ...]
+
+
+def flat(settings: PlainMapping, prefix: str = "") -> dict[str, str]:
+    """Settings of all levels under dotted names, as text."""
+    found: dict[str, str] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            found |= flat(value, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = "none" if value is None else str(value)
+    return found
+
+
+def departures_of(task: str) -> dict[str, tuple[str, str]]:
+    """Setting -> the paper's value and the shipped one, where they differ; ``default`` where a section is silent."""
+    paper, shipped = (load_config(OURS, task, config) for config in ("paper", "tuned"))
+    values = [
+        flat({**run.model, "n_timesteps": run.n_timesteps, "n_envs": run.n_envs, "env": run.env_kwargs})
+        for run in (paper, shipped)
+    ]
+    both = {name: (values[0].get(name, "default"), values[1].get(name, "default")) for name in values[0] | values[1]}
+    return {name: pair for name, pair in sorted(both.items()) if pair[0] != pair[1]}
+
+
+def departures(root: Path, results: Results) -> list[Departure]:
+    """All departures of the shipped agent, each once, with the tasks that have it.
+
+    :param root: folder of the results, for the table of what each row measures
+    :raises ConfigError: if that table cannot be read
+    """
+    table = read_table(root / MEASUREMENTS)
+    tasks: dict[tuple[str, str, str], list[str]] = {}
+    for task in results:
+        for setting, (paper, shipped) in departures_of(task).items():
+            tasks.setdefault((setting, paper, shipped), []).append(task)
+    found = []
+    for (setting, paper, shipped), names in sorted(tasks.items()):
+        measured = [said for task in names for said in _measurements(setting, task, table, results)]
+        found.append(Departure(setting, paper, shipped, tuple(names), tuple(measured)))
+    return found
+
+
+def _measurements(setting: str, task: str, table: Mapping[str, PlainMapping], results: Results) -> list[str]:
+    """What the rows of a task say that take a setting back to the paper's value."""
+    rows = {**table.get("default", {}), **table.get(task, {})}
+    methods = results[task]
+    return [
+        _said(task, row, results)
+        for row, settings in rows.items()
+        if setting in settings and row in methods and OURS in methods
+    ]
+
+
+def _said(task: str, row: str, results: Results) -> str:
+    ours, theirs = results[task][OURS], results[task][row]
+    gained, unequal = difference_of(ours, theirs), differences(theirs, ours)
+    said = f"{task}: {gained.mean:+.3f} ({gained.low:+.3f} to {gained.high:+.3f}) against {row}"
+    return f"{said}, which differs in {'; '.join(unequal)}" if unequal else said
+
+
+def departures_table(root: Path, results: Results) -> list[list[str]]:
+    """The departures as cells."""
+    table = [["setting", "paper", "shipped", "tasks", "what it is worth"]]
+    for row in departures(root, results):
+        measured = "; ".join(row.measured) or NOT_MEASURED
+        everywhere = len(row.tasks) == len(results) > 1
+        table.append([row.setting, row.paper, row.shipped, "all" if everywhere else ", ".join(row.tasks), measured])
+    return table
