@@ -16,7 +16,6 @@ import argparse
 import json
 import re
 import sys
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from gymnasium.wrappers import FrameStackObservation, TransformObservation
+from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -39,8 +38,6 @@ NAMES = {
     "sac": "SAC, memoryless",
     "ndbc": "NDBCSAC, NDBC circuit",
     "gru": "NDBCSAC, GRU",
-    "stacked": "SAC, last three observations",
-    "full": "SAC that sees the velocity",
 }
 SHARED: Plain = {"learning_rate": 1e-3, "learning_starts": 1000, "train_freq": 2, "gradient_steps": 1, "device": "cpu"}
 SEQUENCES: Plain = {"sequence_length": 8, "burn_in": 3}
@@ -52,19 +49,15 @@ EVERY = 2500
 EPISODES = 50
 
 
-def make_task(kind: str = "sac") -> Env:
-    """Pendulum without velocities; for the references, with them or with the last three observations."""
-    env: Env = gym.make("Pendulum-v1")
-    if kind == "full":
-        return env
+def make_task() -> Env:
+    """Pendulum without velocities."""
     box = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
-    env = TransformObservation(env, lambda observation: observation[:2], box)
-    return FrameStackObservation(env, 3) if kind == "stacked" else env
+    return TransformObservation(gym.make("Pendulum-v1"), lambda observation: observation[:2], box)
 
 
 def make_agent(kind: str, seed: int) -> SAC:
     """An agent of one kind, untrained."""
-    env = make_vec_env(lambda: make_task(kind), 1, seed=seed)
+    env = make_vec_env(make_task, 1, seed=seed)
     if kind in ("ndbc", "gru", "ltc", "cfc"):
         policy = {"net_arch": [64, 64], "cell": kind}
         own: Plain = {"batch_size": N_SEQUENCES, "replay_buffer_kwargs": SEQUENCES, "policy_kwargs": policy}
@@ -73,31 +66,37 @@ def make_agent(kind: str, seed: int) -> SAC:
 
 
 def trial(kind: str, seed: int, steps: int) -> Plain:
-    """Returns of an agent while it learns: mean return of each evaluation, the last one first in importance."""
-    start, agent, returns = time.process_time(), make_agent(kind, seed), []
+    """Mean return of each evaluation while an agent learns, its updates, and the size of its actor."""
+    agent, returns = make_agent(kind, seed), []
     for _ in range(steps // EVERY):
         agent.learn(EVERY, reset_num_timesteps=False)
-        test = make_vec_env(lambda: make_task(kind), 10, seed=1_000_000)
+        test = make_vec_env(make_task, 10, seed=1_000_000)
         returns.append(round(float(evaluate_policy(agent, test, EPISODES)[0]), 1))  # type: ignore[arg-type]
         print(kind, seed, agent.num_timesteps, returns[-1], file=sys.stderr, flush=True)
-    seconds = round(time.process_time() - start)
     parameters = sum(p.numel() for p in agent.actor.parameters())
-    return {"returns": returns, "updates": agent._n_updates, "seconds": seconds, "actor_parameters": parameters}
+    return {"returns": returns, "updates": agent._n_updates, "actor_parameters": parameters}
 
 
 def table(found: dict[str, Plain], seeds: Sequence[int], steps: int) -> str:
-    """The runs of each kind of agent, as Markdown."""
-    lines = ["| agent | actor's parameters | return | half way | seconds of CPU |", "|---|---|---|---|---|"]
+    """Mean return over seeds with its interval, after 5,000, 10,000, ... steps, as Markdown."""
+    columns = range(5000, steps + 1, 5000)
+    lines = [f"| agent | actor's parameters | {' | '.join(f'{n:,} steps' for n in columns)} |"]
+    lines.append("|---" * (2 + len(columns)) + "|")
     for kind, name in NAMES.items():
-        runs = [found[key] for key in (f"{kind} {seed} {steps}" for seed in seeds) if key in found]
+        runs = [found[key] for key in (f"{kind} {seed}" for seed in seeds) if key in found]
         if runs:
-            last, half = (
-                bootstrap_mean([run["returns"][at] for run in runs]) for at in (-1, len(runs[0]["returns"]) // 2 - 1)
-            )
-            cells = [f"{x.mean:.0f} [{x.low:.0f}, {x.high:.0f}]" for x in (last, half)]
-            seconds = np.mean([run["seconds"] for run in runs])
-            lines.append(f"| {name} | {runs[0]['actor_parameters']} | {' | '.join(cells)} | {seconds:.0f} |")
+            cells = [_cell([run["returns"][: n // EVERY] for run in runs], n, len(seeds)) for n in columns]
+            lines.append(f"| {name} | {runs[0]['actor_parameters']:,} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _cell(curves: Sequence[Sequence[float]], steps: int, n_seeds: int) -> str:
+    """The last values of curves that are so long, if there is one for each seed."""
+    values = [curve[-1] for curve in curves if len(curve) == steps // EVERY]
+    if len(values) < n_seeds:
+        return "-"
+    mean = bootstrap_mean(values)
+    return f"{mean.mean:.0f} [{mean.low:.0f}, {mean.high:.0f}]"
 
 
 def update(page: Path, text: str) -> None:
@@ -119,9 +118,10 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(1)
     found: dict[str, Any] = json.loads(args.results.read_text()) if args.results.is_file() else {}
-    waiting = [(kind, seed) for seed in args.seeds for kind in args.kinds if f"{kind} {seed} {args.steps}" not in found]
+    long_enough = [key for key, run in found.items() if len(run["returns"]) >= args.steps // EVERY]
+    waiting = [(kind, seed) for seed in args.seeds for kind in args.kinds if f"{kind} {seed}" not in long_enough]
     for kind, seed in waiting[: args.most]:
-        found[f"{kind} {seed} {args.steps}"] = trial(kind, seed, args.steps)
+        found[f"{kind} {seed}"] = trial(kind, seed, args.steps)
         write_atomic(args.results, json.dumps(dict(sorted(found.items())), indent=1) + "\n")
     text = table(found, args.seeds, args.steps)
     if args.output is None:
