@@ -27,6 +27,7 @@ newest)
     ;;
 esac
 
+rm -rf build  # what an earlier build left would be packed again
 test -x "$venv/bin/python" || "${PYTHON:-python3}" -m venv "$venv"
 "$venv/bin/python" -m pip install --quiet "${options[@]}" . pytest hypothesis pandas matplotlib tensorboard cloudpickle
 "$venv/bin/python" - <<'END'
@@ -34,4 +35,4 @@ from importlib.metadata import version
 for name in ("stable_baselines3", "sb3_contrib", "torch", "gymnasium", "gymnasium_robotics", "mujoco", "numpy", "scipy"):
     print(f"{name} {version(name)}")
 END
-OMP_NUM_THREADS=1 "$venv/bin/python" -m pytest "${tests[@]}"
+OMP_NUM_THREADS=1 "$venv/bin/pytest" "${tests[@]}"  # not python -m pytest, which would import the checkout

@@ -127,11 +127,14 @@ def _reading_ours(reading: Callable[[Any], tuple[Plain, Plain]]) -> Callable[[An
 def main() -> None:
     """``python -m sb3_tbc.zoo.rl_zoo train --algo hits --env sb3_tbc/Pendulum-v0``: the zoo's commands with ours in it.
 
-    :raises ConfigError: for an unknown command
+    :raises SystemExit: for an unknown command, or without rl_zoo3
     """
     if len(sys.argv) < 2 or sys.argv[1] not in COMMANDS:
-        raise ConfigError(f"say which command of the zoo: {', '.join(COMMANDS)}")
-    register()
+        raise SystemExit(f"sb3_tbc.zoo.rl_zoo: error: give a command of the zoo: {', '.join(COMMANDS)}")
+    try:
+        register()
+    except ConfigError as error:
+        raise SystemExit(f"sb3_tbc.zoo.rl_zoo: error: {error}") from error
     importlib.import_module("rl_zoo3.cli").main()
 
 

@@ -14,7 +14,7 @@ from corridor import Corridor
 
 import sb3_tbc.zoo
 from sb3_tbc.extras import MissingExtraError
-from sb3_tbc.zoo.rl_zoo import IN_ZOO, nested, with_subgoals, zoo_settings
+from sb3_tbc.zoo.rl_zoo import IN_ZOO, main, nested, with_subgoals, zoo_settings
 
 TASK = "sb3_tbc/Drawbridge-v0"
 SMALL = ["low.batch_size:16", "high.batch_size:16", "gradient_ratio:0.02", "compile:False", "max_options:5", "dt_min:0"]
@@ -37,6 +37,13 @@ def test_without_the_zoo_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setitem(sys.modules, "rl_zoo3", None)
     with pytest.raises(MissingExtraError, match=r"sb3_tbc\[zoo\]"):
         sb3_tbc.zoo.register()
+
+
+@pytest.mark.parametrize("arguments", [[], ["nonsense"]])
+def test_an_unknown_command_is_told_in_one_line(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["rl_zoo", *arguments])
+    with pytest.raises(SystemExit, match="give a command of the zoo: train, enjoy"):
+        main()
 
 
 def command(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: str) -> None:
