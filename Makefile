@@ -11,7 +11,7 @@ SEED ?= 0
 STEPS ?= $(if $(filter Pendulum,$(ENV)),100000,)
 RUN := runs/$(shell date +%Y%m%d-%H%M%S)
 
-.PHONY: help install browser train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks torture bench report pretrained lowest newest clean
+.PHONY: help install browser train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks torture mutation bench report pretrained lowest newest clean
 
 help:
 	@echo "install          .venv with the package (editable) and what its tests need"
@@ -22,6 +22,7 @@ help:
 	@echo "check-codestyle  format and lint, no change  commit-checks format type lint"
 	@echo "report           the results page of the docs and the HTML report, from the ledger in results/"
 	@echo "doc notebooks    build the pages, run the notebooks        bench  steps per second"
+	@echo "mutation         the share of single-line faults that the tests catch, by sample [DIGITS=1]; an hour or so"
 	@echo "torture          kill, stop and damage runs, for the table of docs/reliability.md; takes hours"
 	@echo "lowest newest    the tests of SB3's contract with the lowest, or the newest, supported versions"
 	@echo "pretrained       train the agents that come with the package [TASKS=]"
@@ -79,6 +80,10 @@ report: install
 
 notebooks: install
 	$(BIN)/python -m pytest -m "slow or not slow" tests/test_notebooks.py
+
+mutation: install
+	$(BIN)/python -m pip install --quiet --editable '.[dev]' --constraint constraints.txt
+	$(BIN)/python scripts/mutation.py --digits $(or $(DIGITS),1)
 
 torture: install
 	$(BIN)/python scripts/torture.py all

@@ -11,6 +11,9 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from sb3_tbc.tune.search_space import load_space, restrict
+from sb3_tbc.zoo.config import load_config, parse_overrides
+
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 
@@ -80,3 +83,32 @@ def test_the_table_says_what_happened() -> None:
     assert "| `C-v1` | 1 | DIED with code -9" in text
     assert "Not tried yet: 2 more" in text
     assert "highway-env" in text
+
+
+def test_the_mutation_score_counts_what_was_tried() -> None:
+    mutation = script("mutation")
+    score = mutation.score_of({"a": 1, "b": 0, "c": None, "d": 33, "e": -24})
+    assert (score.tried, score.alive) == (4, ["b", "d"])
+    assert str(score) == "2 of 4 caught (50%)"
+    assert str(mutation.score_of({})) == "none tried"
+    for modules, tests in mutation.SUBJECTS.values():
+        assert all((SCRIPTS.parent / path).is_file() for path in (*modules, *tests))
+
+
+def test_commands_outside_of_the_ledger_are_understood() -> None:
+    from sb3_tbc import train
+    from sb3_tbc.benchmark import command as benchmark
+    from sb3_tbc.tune import command as tune
+
+    parsers = {"sb3_tbc.train": train, "sb3_tbc.benchmark": benchmark, "sb3_tbc.tune": tune}
+    outside = script("outside_ledger")
+    commands = [command for part in outside.PARTS.values() for command in part()]
+    parsed = [(name, parsers[name].build_parser().parse_args(rest)) for name, *rest in commands]
+    assert len(parsed) == 2 + 2 * len(outside.SKILLS) + 2
+    for name, args in parsed:
+        if name == "sb3_tbc.tune":
+            path = SCRIPTS.parent / args.search_space
+            base = load_config("tbc-hrl", args.env, overrides=parse_overrides(args.hyperparams or []))
+            space = restrict(load_space("tbc-hrl", args.env, path), base, args.search, {})
+            assert {"low.learning_rate", "tau", "ndbc.sub_steps", "max_options"} <= set(space)
+            assert "memory" not in space
