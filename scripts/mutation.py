@@ -59,7 +59,7 @@ def mutate(name: str, digits: str, minutes: float) -> Score:
         "source_paths": ["sb3_tbc"],
         "only_mutate": modules,
         "also_copy": [part for part in COPIED if part not in ("sb3_tbc", "pyproject.toml")],
-        "tests_dir": tests,
+        "pytest_add_cli_args_test_selection": tests,
         "pytest_add_cli_args": ["-p", "no:cacheprovider"],
     }
     with tempfile.TemporaryDirectory() as folder:
@@ -73,7 +73,7 @@ def mutate(name: str, digits: str, minutes: float) -> Score:
         try:
             done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60 * minutes)
             if done.returncode:
-                raise SystemExit(f"mutmut failed on {name}: {(done.stderr or done.stdout)[-500:]}")
+                raise SystemExit(f"mutmut failed on {name}: {(done.stdout + done.stderr)[-500:]}")
         except subprocess.TimeoutExpired:
             print(f"{name}: stopped after {minutes:g} minutes; the score is of the mutants tried until then")
         records = [json.loads(path.read_text(encoding="utf-8")) for path in Path(folder, "mutants").rglob("*.meta")]
