@@ -17,7 +17,7 @@ from sb3_tbc.zoo.environments import make_envs
 TASK = "faulty:FaultyCorridor-v0"
 """Nothing fails in it; its episodes are short, so that there is much to learn from."""
 LEVEL = ["batch_size:16", "learning_rate:1e-3"]
-HALF = 400
+HALF = 250
 """N, steps of each environment."""
 Way = Literal["command", "loaded", "same object"]
 
@@ -25,9 +25,9 @@ Way = Literal["command", "loaded", "same object"]
 def settings(algo: str, compile: bool) -> list[str]:
     """Small, and the same at every step: a rate that falls with the run's length would not be."""
     if algo == "sac":
-        return ["gradient_ratio:0.1", "learning_starts:100", *LEVEL]
+        return ["gradient_ratio:0.06", "learning_starts:100", "buffer_size:8000", *LEVEL]
     levels = [f"{level}.{setting}" for level in ("low", "high") for setting in LEVEL]
-    return ["gradient_ratio:0.1", "max_options:3", f"compile:{str(compile).lower()}", *levels]
+    return ["gradient_ratio:0.06", "max_options:3", f"compile:{str(compile).lower()}", *levels]
 
 
 def by_command(root: Path, algo: str, n_envs: int, compile: bool) -> list[str]:
