@@ -10,7 +10,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, NoReturn
 
-from sb3_tbc.errors import ConfigError, TrainingError, WriteError
+from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError, TrainingError, WriteError
 
 FAILED = 1
 USER_MISTAKE = 2
@@ -87,10 +87,10 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
             stream.reconfigure(errors="backslashreplace")  # a path that the terminal cannot show is no reason to fail
     try:
         return command(sys.argv[1:] if argv is None else argv)
-    except (ConfigError, WriteError, TrainingError) as error:
+    except (ConfigError, WriteError, TrainingError, EnvironmentFault, NonFiniteError) as error:
         line = " ".join(str(error).split())
         print(f"{name}: error: {line}", file=sys.stderr)
-        return FAILED if isinstance(error, TrainingError) else USER_MISTAKE
+        return USER_MISTAKE if isinstance(error, ConfigError | WriteError) else FAILED
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED

@@ -29,14 +29,15 @@ because an empty replay buffer is all zeros.
 """
 
 
-def read_text(path: Path) -> str:
+def read_text(path: Path, most: int = MAX_BYTES) -> str:
     """A text file.
 
+    :param most: bytes that it may have
     :raises ConfigError: if it is missing, too large, or no UTF-8
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ConfigError(f"{path} has {path.stat().st_size} bytes; at most {MAX_BYTES} are read")
+        if path.stat().st_size > most:
+            raise ConfigError(f"{path} has {path.stat().st_size} bytes; at most {most} are read")
         return path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise ConfigError(f"cannot read {path}: there is no such file") from error

@@ -7,6 +7,7 @@
     python scripts/torture.py disk               a full disk: files and file systems of limited size
     python scripts/torture.py twice              two runs of one seed
     python scripts/torture.py fuzz --number 10000     nonsense for every reader, and damaged files
+    python scripts/torture.py guided --number 10000   nonsense that atheris finds by watching the code
     python scripts/torture.py tune --number 30   workers and parents of a search killed at random
     python scripts/torture.py long               five million steps: memory, speed, files
     python scripts/torture.py all
@@ -30,7 +31,7 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / "scripts"), *(str(ROOT / "tests" / name) for name in ("reliability", "tune", "."))]
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from tortures import fuzz, long, runs, searches  # noqa: E402 (they need the path)
+from tortures import fuzz, guided_runs, long, runs, searches  # noqa: E402 (they need the path)
 
 TORTURES: dict[str, Callable[[Path, int, int], tuple[int, int]]] = {
     "halves": runs.torture_halves,
@@ -40,6 +41,7 @@ TORTURES: dict[str, Callable[[Path, int, int], tuple[int, int]]] = {
     "disk": runs.torture_disk,
     "twice": runs.torture_twice,
     "fuzz": fuzz.torture_fuzz,
+    "guided": guided_runs.torture_guided,
     "tune": searches.torture_tune,
     "long": long.torture_long,
 }

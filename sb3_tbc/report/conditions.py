@@ -52,9 +52,13 @@ CONDITIONS: dict[str, Callable[[Run], object]] = {
 def condition_values(runs: Sequence[Run]) -> dict[str, list[object]]:
     """Values of each condition over the seeds of a row, each once, in order of appearance."""
     return {
-        name: list(dict.fromkeys(v for run in runs if run.config and (v := value(run)) is not None))
+        name: list(dict.fromkeys(_plain(v) for run in runs if run.config and (v := value(run)) is not None))
         for name, value in CONDITIONS.items()
     }
+
+
+def _plain(value: object) -> object:
+    return value if isinstance(value, str | int | float) else str(value)
 
 
 def differences(runs: Sequence[Run], reference: Sequence[Run]) -> list[str]:

@@ -15,6 +15,7 @@ from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json, read_text, read_yaml
+from sb3_tbc.report.checked import check_final, check_sections
 from sb3_tbc.zoo.callbacks import EvaluationRow
 from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
 
@@ -119,14 +120,14 @@ def _reported(runs: Sequence[Run], tuned_on: Iterable[int]) -> list[Run]:
 
 def _load(folder: RunFolder) -> Run:
     final = folder.read_final()
-    rate = final.get("success_rate")
-    if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0.0 <= rate <= 1.0:
-        raise ValueError(f"success_rate must be a number from 0 to 1, got {rate!r}")
+    check_final(final)
     config = folder.read_config() if folder.exists else {}
     command = _text(folder.path / COMMAND).strip()
     versions = read_json(folder.path / VERSIONS) if (folder.path / VERSIONS).is_file() else {}
     if not isinstance(versions, dict):
         raise ValueError(f"{VERSIONS} must hold named values, got {type(versions).__name__}")
+    check_sections(config, "model", "env_kwargs", "model.high", "model.low")
+    check_sections(versions, "packages")
     return Run(final, folder.read_evaluations(), config, command, versions, folder.path)
 
 

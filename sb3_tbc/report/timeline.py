@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.outside import number, one_line
+from sb3_tbc.reading import read_text
 
 TRACE = "options.csv"
+MOST_BYTES = 2**30
+"""Largest trace that is read; a million options have some 60 MB."""
+MOST_STEPS = 1e9
 MOST = 40
 """Largest number of options drawn; of a longer episode the first ones are shown."""
 
@@ -18,23 +25,28 @@ def last_episode(path: Path) -> list[Plain]:
     """The options of the last whole episode of the first environment in a trace, in order.
 
     :return: ``time_budget``, ``duration`` (environment steps), ``reached``, ``reason``; empty without a whole episode
-    :raises ValueError: if the file has other columns
+    :raises ConfigError: if the file cannot be read or has other columns
     """
     episodes: list[list[Plain]] = []
     open_one: list[Plain] = []
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
+    reader = csv.DictReader(io.StringIO(read_text(path, MOST_BYTES), newline=""))
+    try:
         if not {"env", "time_budget", "duration", "reached", "reason", "episode_over"} <= set(reader.fieldnames or ()):
-            raise ValueError(f"{path} is not a trace of options: its columns are {reader.fieldnames}")
+            raise ConfigError(f"{path} is not a trace of options: its columns are {one_line(reader.fieldnames)}")
         for row in reader:
             if row["env"] != "0":
                 continue
             open_one.append({
-                "time_budget": float(row["time_budget"]), "duration": int(row["duration"]),
+                "time_budget": number(float(row["time_budget"]), "time_budget", 0.0, MOST_STEPS),
+                "duration": int(number(int(row["duration"]), "duration", 0.0, MOST_STEPS)),
                 "reached": row["reached"] == "1", "reason": row["reason"],
             })  # fmt: skip
             if row["episode_over"] == "1":
                 episodes, open_one = [open_one], []
+    except ConfigError:
+        raise
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as error:
+        raise ConfigError(f"{path} holds a line that is not an option: {one_line(error)}") from error
     return episodes[-1] if episodes else []
 
 

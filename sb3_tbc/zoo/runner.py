@@ -394,7 +394,13 @@ def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, 
 
     :param trained: seconds that training took
     """
-    result = _final(model, spec, folder, trained)
+    try:
+        result = _final(model, spec, folder, trained)
+    except (EnvironmentFault, NonFiniteError) as error:
+        raise TrainingError(
+            f"the evaluation after training failed: {one_line(error, 1000)}. The agent is saved; evaluate it with: "
+            f"python -m sb3_tbc.train --resume {shlex.quote(str(folder.path))}"
+        ) from error
     folder.finish(result)
     if not options.keep_checkpoint:
         remove_checkpoints(folder.path)

@@ -251,3 +251,18 @@ def test_the_command_ends_saved_and_is_resumed(algo: str, tmp_path: Path, capsys
     assert "success rate" in said
     ended = ["--on-bad-step", "end-episode", "--variant", "ended", "--hyperparams", *small, *fault]
     assert train.main([*arguments, *ended]) == 0
+
+
+def test_a_fault_in_the_last_evaluation_is_one_line_and_can_be_tried_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["--env", "faulty:FaultyCorridor-v0", "--n-timesteps", "60", "--eval-freq", "100000", "--no-progress"]
+    arguments += ["--log-folder", str(tmp_path), "--n-final-episodes", "300", "--hyperparams", "compile:false"]
+    arguments += ["max_options:3", "env_kwargs.kind:nan"]
+    assert train.main(arguments) == 1
+    said = capsys.readouterr().err.strip().splitlines()
+    assert "the evaluation after training failed: environment" in said[-1]
+    (folder,) = tmp_path.glob("*/*/*/seed_0")
+    config = folder / "config.yml"
+    config.write_text(config.read_text().replace("kind: nan", "kind: ''"))
+    assert train.main(["--resume", str(folder), "--no-progress"]) == 0

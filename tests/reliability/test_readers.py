@@ -148,6 +148,11 @@ def test_numbers_that_are_none(value: object) -> None:
         "u:SECRET@h/db",
         "redis://:SECRET@h:6379/0",
         "host=h user=u password=SECRET dbname=x",
+        "postgresql+psycopg://u:a:SECRET@h:5432/db",
+        "mysql+pymysql://u:SECRET@[::1]:3306/db",
+        "postgresql://u@h/db?sslmode=require&sslpassword=SECRET",
+        "sqlite+pysqlcipher://:SECRET@/study.db",
+        "postgresql://u:SECRET@h,h2:5433/db?target_session_attrs=any",
     ],
 )
 def test_passwords_are_not_shown(url: str) -> None:

@@ -176,6 +176,7 @@ NONSENSE: dict[str, list[Any]] = {
     "sequence_length": [0, 10**9, 2],
     "compile": ["yes", 1],
     "window_end": ["soon"],
+    "on_bad_step": ["never", True],
     "hindsight_goals": ["asked"],
     "low.near_misses": [0.5],
 }

@@ -1,0 +1,50 @@
+"""What a run says of itself is looked at before any of it is averaged, compared or printed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+from sb3_tbc.aliases import PlainMapping
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.outside import number, one_line
+
+SHARES = ("success_rate", "best_success_rate", "stable_share", "worst_after_first_90", "subgoal_success")
+NUMBERS = ("mean_length", "mean_length_success", "mean_window", "wall_time", "steps_per_second")
+COUNTS = ("n_timesteps", "n_episodes", "seed", "eval_seed")
+TEXTS = ("task", "algo", "variant", "env_id", "config", "outcomes")
+LARGEST = 1e15
+
+
+def check_final(final: PlainMapping) -> None:
+    """Refuse a ``final.json`` whose values are not what they are called.
+
+    :raises ConfigError: naming the value
+    """
+    number(final.get("success_rate"), "success_rate", 0.0, 1.0)
+    for names, high in ((SHARES, 1.0), (NUMBERS, LARGEST), (COUNTS, LARGEST)):
+        for name in names:
+            if final.get(name) is not None:
+                number(final[name], name, 0.0, high)
+    for name in COUNTS:
+        if not float(final.get(name) or 0).is_integer():
+            raise ConfigError(f"{name} must be a whole number, got {final[name]!r}")
+    for name in TEXTS:
+        if not isinstance(final.get(name), str | None):
+            raise ConfigError(f"{name} must be a text, got {one_line(repr(final[name]), 100)}")
+    if not re.fullmatch("[01]*", final.get("outcomes") or ""):
+        raise ConfigError("outcomes must be a text of 0 and 1")
+
+
+def check_sections(data: PlainMapping, *names: str) -> None:
+    """Refuse a value that is not a section of named values where one must be; it may be missing.
+
+    :param names: of the sections; dots lead into one
+    :raises ConfigError: naming it
+    """
+    for name in names:
+        part: object = data
+        for key in name.split("."):
+            part = part.get(key) if isinstance(part, Mapping) else None
+        if not isinstance(part, Mapping | None):
+            raise ConfigError(f"{name} must hold named values, got {one_line(repr(part), 100)}")
