@@ -32,6 +32,7 @@ def settings(algo: str, compile: bool) -> list[str]:
 
 def by_command(root: Path, algo: str, n_envs: int, compile: bool) -> list[str]:
     """What differs between ``train --n-timesteps 2N`` and N steps that ``--resume --n-timesteps 2N`` continues."""
+    root.mkdir(parents=True, exist_ok=True)
     steps = HALF * n_envs
     watched = ["--eval-freq", steps // 2, "--n-eval-episodes", 1, "--n-final-episodes", 1, "--no-progress", "--trace"]
     fixed = ["--hyperparams", *settings(algo, compile), "--env", TASK, "--algo", algo, "--n-envs", n_envs]
