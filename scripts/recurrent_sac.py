@@ -31,7 +31,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_tbc import NDBCSAC
 from sb3_tbc.aliases import Env, Plain
 from sb3_tbc.files import write_atomic
-from sb3_tbc.stats import bootstrap_mean
+from sb3_tbc.stats import bootstrap_mean, welch_test
 
 DOCS = Path(__file__).parents[1] / "docs"
 NAMES = {
@@ -90,6 +90,18 @@ def table(found: dict[str, Plain], seeds: Sequence[int], steps: int) -> str:
     return "\n".join(lines)
 
 
+def tests(found: dict[str, Plain], seeds: Sequence[int], steps: int) -> str:
+    """Welch's test of the last returns of each kind of agent against memoryless SAC, in a sentence."""
+    ends: dict[str, list[float]] = {kind: [] for kind in NAMES}
+    for key, run in found.items():
+        kind, seed = key.split()
+        if kind in ends and int(seed) in seeds:
+            ends[kind].append(run["returns"][: steps // EVERY][-1])
+    others = [kind for kind in NAMES if kind != "sac" and len(ends[kind]) > 1 and len(ends["sac"]) > 1]
+    told = [f"{NAMES[kind]} p = {welch_test(ends[kind], ends['sac']):.3f}" for kind in others]
+    return f"Welch's test against SAC without memory, after {steps:,} steps: {', '.join(told)}."
+
+
 def _cell(curves: Sequence[Sequence[float]], steps: int, n_seeds: int) -> str:
     """The last values of curves that are so long, if there is one for each seed."""
     values = [curve[-1] for curve in curves if len(curve) == steps // EVERY]
@@ -123,7 +135,7 @@ def main() -> None:
     for kind, seed in waiting[: args.most]:
         found[f"{kind} {seed}"] = trial(kind, seed, args.steps)
         write_atomic(args.results, json.dumps(dict(sorted(found.items())), indent=1) + "\n")
-    text = table(found, args.seeds, args.steps)
+    text = f"{table(found, args.seeds, args.steps)}\n\n{tests(found, args.seeds, args.steps)}"
     if args.output is None:
         print(text)
     else:

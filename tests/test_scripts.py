@@ -65,6 +65,19 @@ def test_the_committed_table_is_that_of_the_committed_results() -> None:
         assert not [said for said in result.values() if str(said).startswith(("TRACEBACK", "DIED", "TIMEOUT"))]
 
 
+def test_the_committed_comparison_is_that_of_the_committed_runs() -> None:
+    compare, docs = script("recurrent_sac"), SCRIPTS.parent / "docs"
+    runs = json.loads((docs / "recurrent_sac.json").read_text())
+    page = (docs / "recurrent_sac.md").read_text()
+    assert compare.table(runs, range(5), 15_000) in page
+    assert compare.tests(runs, range(5), 15_000) in page
+    ends = {kind: [runs[f"{kind} {seed}"]["returns"][-1] for seed in range(5)] for kind in ("sac", "ndbc", "gru")}
+    assert min(ends["ndbc"] + ends["gru"]) > max(ends["sac"])
+    assert {run["updates"] for run in runs.values()} == {7000}
+    del runs["gru 3"]
+    assert "| - |" in compare.table(runs, range(5), 15_000)
+
+
 def test_the_table_says_what_happened() -> None:
     table = script("goal_environments")
     well = {"id": "panda_gym:A-v1", "training": "yes", "evaluating": "yes", "filming": "yes", "exporting": "yes"}
