@@ -29,7 +29,10 @@ class AsGoalEnv(gym.Wrapper):  # type: ignore[type-arg]
         self.discrete = isinstance(env.action_space, spaces.Discrete)
         if self.discrete:
             self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
-        low, high = np.full(width, -2.0), np.full(width, 2.0)
+        bounds = spaces.flatten_space(raw["achieved_goal"]) if self.is_goal else flat
+        bounded = np.isfinite(bounds.low[:width]) & np.isfinite(bounds.high[:width])
+        low = np.where(bounded, bounds.low[:width] - 0.1, -2.0)
+        high = np.where(bounded, bounds.high[:width] + 0.1, 2.0)
         self.subgoals = SubgoalSpace.from_slices(
             low, high, np.full(width, 0.2), local_scale=np.ones(flat.shape[0]), names=[f"x{i}" for i in range(width)]
         )
