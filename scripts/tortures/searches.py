@@ -56,23 +56,24 @@ def _study(folder: Path, storage: str, kills: int, rng: random.Random) -> tuple[
     done = 0
     for _ in range(20 * kills):
         with _search(folder, storage, wanted) as parent:
-            until = time.monotonic() + rng.uniform(2.0, 7.0)
+            until = time.monotonic() + (LONGEST if done >= kills else rng.uniform(2.0, 7.0))
             while time.monotonic() < until and _alive(parent):
                 time.sleep(0.05)
-            victims = [parent, *_children(parent)]
             if done < kills and _alive(parent):
-                victim = rng.choice(victims)
+                workers = _children(parent)
+                victim = rng.choice([parent, *workers])
                 with suppress(ProcessLookupError):
                     os.kill(victim, signal.SIGKILL)
                     done += 1
-                if victim != parent:  # the other worker goes on, as it would
-                    time.sleep(rng.uniform(0.0, 2.0))
-            elif _alive(parent):
-                _wait(parent, 240.0)
+                _wait([parent, *workers])  # what was not killed ends by itself, and gives up or finishes its trial
         study = optuna.load_study(study_name=NAME, storage=open_storage(storage, GRACE)) if _exists(storage) else None
         if study is not None and done >= kills and count_done(study) >= wanted:
             return done, _problems(study, wanted)
     return done, ["the search did not end"]
+
+
+LONGEST = 120.0
+"""Seconds that a search may take to its end, with a worker killed or without."""
 
 
 @contextmanager
@@ -126,9 +127,9 @@ def _children(parent: int) -> list[int]:
     return [int(child) for child in found]
 
 
-def _wait(parent: int, seconds: float) -> None:
-    until = time.monotonic() + seconds
-    while time.monotonic() < until and _alive(parent):
+def _wait(processes: list[int]) -> None:
+    until = time.monotonic() + LONGEST
+    while time.monotonic() < until and any(map(_alive, processes)):
         time.sleep(0.1)
 
 
@@ -149,8 +150,13 @@ def _problems(study: optuna.Study, wanted: int) -> list[str]:
         found.append("the baseline was not done once")
     if any(len(t.user_attrs.get("seed_values", {})) != 2 for t in done):
         found.append("a trial was done without all of its seeds")
-    retried = {t.system_attrs.get("failed_trial") for t in trials}
-    known = [str(sorted(t.params.items())) for t in done]
-    lost = [t.number for t in trials if t.state == TrialState.FAIL and t.params and t.number not in retried
-            and t.system_attrs.get("failed_trial") is None and str(sorted(t.params.items())) not in known]  # fmt: skip
+    chains = {t.system_attrs.get("failed_trial", t.number) for t in trials if t.params}  # a trial and its repetitions
+    kept = {t.system_attrs.get("failed_trial", t.number) for t in done}
+    kept |= {t.number for t in trials if t.state == TrialState.FAIL and t.number not in _repeated(trials)
+             and any(t.params == other.params for other in done)}  # fmt: skip
+    lost = sorted(chains - kept)
     return [*found, *([f"trials {lost} were lost"] if lost else [])]
+
+
+def _repeated(trials: list[optuna.trial.FrozenTrial]) -> set[int]:
+    return {t.system_attrs["failed_trial"] for t in trials if "failed_trial" in t.system_attrs}
