@@ -21,14 +21,19 @@ CASES = [(algo, n_envs) for algo in ("tbc-hrl", "hits", "hac", "sac") for n_envs
 """Algorithms and numbers of environments that take turns."""
 
 
-def arguments_of(algo: str, n_envs: int, compile: bool = False) -> list[Any]:
-    """A short training run, with all that is watched."""
-    steps = 900 * n_envs
+def arguments_of(algo: str, n_envs: int, compile: bool = False, task: str = "Pendulum") -> list[Any]:
+    """A short training run, with all that is watched; on the corridor, shorter and with more checkpoints."""
+    steps = (900 if task == "Pendulum" else 150) * n_envs
     watched = ["--n-timesteps", steps, "--eval-freq", steps // 2, "--n-envs", n_envs, *WATCHED]
     small = (
         SMALL_FLAT if algo == "sac" else [s.replace("compile:false", f"compile:{str(compile).lower()}") for s in SMALL]
     )
-    return ["--env", "Pendulum", "--algo", algo, *watched, *small]
+    small = [*small, "buffer_size:5000"] if algo == "sac" else small
+    return ["--env", task, "--algo", algo, *watched, *small]
+
+
+CORRIDOR = "faulty:FaultyCorridor-v0"
+"""A task whose episodes take a dozen steps; nothing fails in it here."""
 
 
 class Undisturbed:
@@ -38,12 +43,12 @@ class Undisturbed:
         self.root = root
         self._seconds: dict[Path, float] = {}
 
-    def get(self, algo: str, n_envs: int, compile: bool = False) -> tuple[Path, float]:
+    def get(self, algo: str, n_envs: int, compile: bool = False, task: str = "Pendulum") -> tuple[Path, float]:
         """Its folder, and how long it took."""
-        root = self.root / f"whole-{algo}-{n_envs}-{'compiled' if compile else 'eager'}"
+        root = self.root / f"whole-{algo}-{n_envs}-{'compiled' if compile else 'eager'}-{task[:5]}"
         begun = time.monotonic()
         if root not in self._seconds:
-            arguments = [*arguments_of(algo, n_envs, compile), "--log-folder", root / "runs"]
+            arguments = [*arguments_of(algo, n_envs, compile, task), "--log-folder", root / "runs"]
             root.mkdir(parents=True)
             if run(arguments, root / "log") != 0:
                 raise RuntimeError((root / "log").read_text()[-2000:])
@@ -89,10 +94,10 @@ def _struck(root: Path, number: int, first: int, signals: Sequence[int], allowed
     for k in range(first, first + number):
         rng = random.Random(k)
         algo, n_envs = CASES[k % len(CASES)]
-        whole, seconds = undisturbed.get(algo, n_envs)
+        whole, seconds = undisturbed.get(algo, n_envs, task=CORRIDOR)
         folder = root / f"struck-{k}"
         folder.mkdir()
-        arguments = [*arguments_of(algo, n_envs), "--log-folder", folder / "runs"]
+        arguments = [*arguments_of(algo, n_envs, task=CORRIDOR), "--log-folder", folder / "runs"]
         child = spawn(arguments, folder / "log")
         time.sleep(rng.uniform(0.0, seconds))
         number_of_signal = signals[k % len(signals)]
