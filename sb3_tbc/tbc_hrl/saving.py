@@ -33,8 +33,8 @@ class PlainAlgorithm(BaseAlgorithm):
     SB3's own functions read the file as any other.
     """
 
-    config_class: ClassVar[type[Settings]]
-    """The agent's settings."""
+    config_class: ClassVar[type[Settings]] = Settings
+    """The agent's settings; none of its own where the algorithm takes SB3's."""
 
     def save(
         self,

@@ -48,7 +48,8 @@ def test_ids_of_gymnasium_robotics_need_no_module() -> None:
         ("no_such_module:Env-v0", "cannot import module 'no_such_module'"),
     ],
 )
-def test_unknown_names(name: str, message: str) -> None:
+def test_unknown_names(name: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(gym.registry, name, raising=False)  # another test may have imported its package
     with pytest.raises(ConfigError, match=message):
         resolve_env(name)
 
