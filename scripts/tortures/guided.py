@@ -25,7 +25,7 @@ with atheris.instrument_imports(include=WATCHED):
     from sb3_tbc.ndbc.wiring import NDBCWiring
     from sb3_tbc.tbc_hrl.archive import read_data
     from sb3_tbc.tbc_hrl.plain import NotPlainError, decode
-    from sb3_tbc.tune.search_space import load_space
+    from sb3_tbc.tune.search_space import read_sections
     from sb3_tbc.zoo.callbacks import read_evaluations
     from sb3_tbc.zoo.config import load_config, parse_overrides
 
@@ -60,7 +60,7 @@ def search(content: bytes) -> None:
     """A file of ranges."""
     path = FOLDER.with_suffix(".yml")
     path.write_bytes(content)
-    load_space("tbc-hrl", "Pendulum", path)
+    read_sections(path)
 
 
 def wiring(content: bytes) -> None:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-from injection import differences, run, tensors, the_run
+from injection import differences, recorded, run, tensors, the_run
 
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.zoo.algorithms import algorithm
@@ -96,10 +96,9 @@ def contents_of(model: Any, folder: Path) -> dict[str, Any]:
     else:
         for name, buffer in model.replay_buffer._asdict().items():
             found |= {f"{name}.{key}": array[: buffer.size()].tobytes() for key, array in buffer.data.items()}
-    for name, array in model.learning_state().items():
-        if ".recorder." in name and array.ndim > 1:  # what lies behind the steps done is left over
-            array = array[:, : max(model.collector.env.get_state()["recorder.steps"])]
-        found[f"state.{name}"] = array.tobytes()
+    state = model.learning_state()
+    steps = state.get("collector.recorder.steps", ())
+    found |= {f"state.{name}": recorded(f".{name}", array, steps).tobytes() for name, array in state.items()}
     with (folder / "evaluations.csv").open() as file:
         found["evaluations"] = [{k: v for k, v in row.items() if k != "wall_time"} for row in csv.DictReader(file)]
     found["counts"] = (model.num_timesteps, model._n_updates, model._episode_num)

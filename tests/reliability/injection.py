@@ -147,6 +147,17 @@ def tensors(value: Any, name: str = "") -> dict[str, Any]:
     return found
 
 
+def recorded(name: str, array: Any, steps: Any) -> Any:
+    """An array of a saved run without what lies behind the steps done in each environment, left of earlier episodes.
+
+    :param steps: of the running episodes, ``(n_envs,)``
+    """
+    if ".recorder." not in name or array.ndim < 2 or name.endswith(".options"):
+        return array
+    done = np.arange(array.shape[1]) < np.asarray(steps)[:, None]
+    return array[done]
+
+
 def contents(folder: Path) -> dict[str, Any]:
     """All that must be the same in two runs of one seed: weights, optimisers, curves, result, options."""
     found: dict[str, Any] = {}
@@ -159,13 +170,8 @@ def contents(folder: Path) -> dict[str, Any]:
     replay = folder / "checkpoint" / "replay_buffer.pkl"
     if replay.is_file():
         with np.load(replay, allow_pickle=False) as arrays:
-            done = arrays.get("running.collector.recorder.steps", [0])
-            for name in arrays.files:
-                recorded = (
-                    ".recorder." in name and arrays[name].ndim > 1
-                )  # what lies behind the steps done is left over
-                array = arrays[name][:, : max(done)] if recorded else arrays[name]
-                found[f"replay:{name}"] = array.tobytes()
+            done = arrays.get("running.collector.recorder.steps", np.zeros(0, int))
+            found |= {f"replay:{name}": recorded(name, arrays[name], done).tobytes() for name in arrays.files}
     with (folder / "evaluations.csv").open() as file:
         found["evaluations"] = [{k: v for k, v in row.items() if k != "wall_time"} for row in csv.DictReader(file)]
     result = json.loads((folder / "final.json").read_text())
