@@ -23,7 +23,7 @@ from sb3_tbc.tune.study import COUNTED, ORIGIN, count_done, open_storage
 NAME = f"tbc-hrl-{ENV_ID}"
 GRACE = 3
 """Seconds of silence after which a worker counts as dead."""
-TRIALS_PER_KILL = 1.5
+TRIALS_PER_KILL = 3.0
 """So many trials a study has for each kill, so that most of the kills hit a running search."""
 TINY = ["compile:false", "gradient_ratio:0.02", "low.buffer_size:2000", "high.buffer_size:500", "n_timesteps:400"]
 
@@ -56,16 +56,18 @@ def _study(folder: Path, storage: str, kills: int, rng: random.Random) -> tuple[
     done = 0
     for _ in range(20 * kills):
         with _search(folder, storage, wanted) as parent:
-            until = time.monotonic() + (LONGEST if done >= kills else rng.uniform(2.0, 7.0))
-            while time.monotonic() < until and _alive(parent):
-                time.sleep(0.05)
-            if done < kills and _alive(parent):
+            while done < kills and _alive(parent):
+                time.sleep(rng.uniform(1.5, 4.0))
                 workers = _children(parent)
                 victim = rng.choice([parent, *workers])
-                with suppress(ProcessLookupError):
-                    os.kill(victim, signal.SIGKILL)
-                    done += 1
-                _wait([parent, *workers])  # what was not killed ends by itself, and gives up or finishes its trial
+                if not _alive(victim):
+                    continue
+                os.kill(victim, signal.SIGKILL)
+                done += 1
+                if victim == parent:  # its workers end by themselves, after the trials that they are at
+                    _wait(workers)
+            if done >= kills:
+                _wait([parent])
         study = optuna.load_study(study_name=NAME, storage=open_storage(storage, GRACE)) if _exists(storage) else None
         if study is not None and done >= kills and count_done(study) >= wanted:
             return done, _problems(study, wanted)
@@ -123,8 +125,8 @@ def _alive(process: int) -> bool:
 
 
 def _children(parent: int) -> list[int]:
-    found = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-    return [int(child) for child in found]
+    path = Path(f"/proc/{parent}/task/{parent}/children")
+    return [int(child) for child in path.read_text().split()] if path.exists() else []
 
 
 def _wait(processes: list[int]) -> None:
