@@ -157,8 +157,12 @@ def wrong_shape(observation: object, shapes: Shapes) -> str | None:
 
     :param shapes: names of its parts with their shapes
     """
-    if isinstance(observation, dict) and all(getattr(observation.get(k), "shape", None) == s for k, s in shapes):
-        return None
+    if isinstance(observation, dict):  # the usual case, without the cost of a generator
+        for key, shape in shapes:
+            if getattr(observation.get(key), "shape", None) != shape:
+                break
+        else:
+            return None
     for key, shape in shapes:
         part = observation.get(key) if isinstance(observation, dict) else None
         if part is None or _shape(part) != shape:

@@ -91,7 +91,7 @@ class Guard:
         observation, rewards, dones, given = step_or_name(self.venv, actions, steps)
         infos: list[Plain] = list(given)
         seen = before_reset(observation, dones, infos)  # type: ignore[arg-type]
-        well = all_finite(*(seen[key] for key in GOAL_KEYS), rewards) and not any(BAD_STEP in info for info in infos)
+        well = all_finite(*[seen[key] for key in GOAL_KEYS], rewards) and not _any_bad(infos)
         bad = self._none_bad if well else self._end_bad(observation, rewards, dones, infos, seen, steps)  # type: ignore[arg-type]
         if np.count_nonzero(dones):
             self._refuse_resets(observation, dones)  # type: ignore[arg-type]
@@ -166,11 +166,18 @@ def _raise(
         raise NonFiniteError(f"{place(index, step)}: {what}. {then}")
 
 
+def _any_bad(infos: list[Plain]) -> bool:
+    """Whether an environment's limit found something wrong with its step."""
+    for info in infos:  # noqa: SIM110 - a generator costs more than the few environments
+        if BAD_STEP in info:
+            return True
+    return False
+
+
 def before_reset(observation: GoalObservation, dones: BoolArray, infos: list[Plain]) -> GoalObservation:
     """What a step led to: SB3 hides the last observation of an episode in ``info``."""
     ended = np.flatnonzero(dones) if np.count_nonzero(dones) else ()
-    bad = [index for index, info in enumerate(infos) if BAD_STEP in info]
-    if not len(ended) and not bad:
+    if not len(ended) and not _any_bad(infos):
         return observation
     seen = {key: np.array(observation[key]) for key in observation}
     for index in ended:

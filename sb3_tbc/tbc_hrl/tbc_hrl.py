@@ -30,7 +30,13 @@ from sb3_tbc.tbc_hrl import assembly, resume
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
-from sb3_tbc.tbc_hrl.calls import explain_level_setting, refuse_level_setting, refuse_vec_normalize, whole_steps
+from sb3_tbc.tbc_hrl.calls import (
+    OF_A_LEVEL,
+    explain_level_setting,
+    refuse_level_setting,
+    refuse_vec_normalize,
+    whole_steps,
+)
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import (
@@ -157,7 +163,8 @@ class TBCHRL(TwoLevelSaving):
 
         def __setattr__(self, name: str, value: object) -> None:
             """Refuse what changes nothing: settings of a level, as SB3's agents of one level have them."""
-            refuse_level_setting(name, value)
+            if name in OF_A_LEVEL:  # set in every step: a call costs more than the look
+                refuse_level_setting(name, value)
             super().__setattr__(name, value)
 
     # ------------------------------------------------------------------ set-up
