@@ -92,6 +92,8 @@ class Guard:
         infos: list[Plain] = list(given)
         seen = before_reset(observation, dones, infos)  # type: ignore[arg-type]
         well = all_finite(*[seen[key] for key in GOAL_KEYS], rewards) and not _any_bad(infos)
+        if not well and seen is observation:  # what was seen and what the reset shows are to differ from here on
+            seen = {key: np.array(part) for key, part in seen.items()}
         bad = self._none_bad if well else self._end_bad(observation, rewards, dones, infos, seen, steps)  # type: ignore[arg-type]
         if np.count_nonzero(dones):
             self._refuse_resets(observation, dones)  # type: ignore[arg-type]
