@@ -95,8 +95,8 @@ def work(job: Job, index: int, stop: StopRequest) -> None:
     :raises KeyboardInterrupt: when stopped, after the trial was put back into the queue
     """
     study, runner = load(job, index, stop)
-    parent = os.getppid()
-    while time.time() < job.until and os.getppid() == parent:
+    parent = multiprocessing.parent_process()  # of a worker; the command itself outlives the shell that began it
+    while time.time() < job.until and (parent is None or parent.is_alive()):
         if stop:
             raise KeyboardInterrupt
         retire_stale(study)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from postgres import private_server
 from sb3_tbc.tune.study import COUNTED, ORIGIN, WORKER, count_done, open_storage
 
 HERE = Path(__file__).parent
+MODULES = os.pathsep.join([str(HERE), str(HERE.parent)])
 NAME = "tbc-hrl-TunedCorridor-v0"
 GRACE = 8
 N_TRIALS = 3
@@ -32,7 +34,7 @@ def command(folder: Path, storage: str, *more: str) -> list[str]:
 
 
 def start(arguments: list[str], log: Path) -> subprocess.Popen[bytes]:
-    environment = {**os.environ, "PYTHONPATH": str(HERE), "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "PYTHONPATH": MODULES, "OMP_NUM_THREADS": "1"}
     with log.open("wb") as output:
         return subprocess.Popen(arguments, stdout=output, stderr=output, env=environment, start_new_session=True)
 
@@ -88,6 +90,17 @@ def test_a_killed_worker_on_a_journal(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_a_search_outlives_the_shell_that_began_it(tmp_path: Path) -> None:
+    """As with ``nohup ... &`` and a logout: the command's parent ends while the search runs."""
+    log, storage = tmp_path / "tune.log", str(tmp_path / "study.log")
+    until_it_runs = f"until grep -q begins {shlex.quote(str(log))}; do sleep .1; done"
+    shell = ["sh", "-c", f"{shlex.join(command(tmp_path, storage))} & {until_it_runs}"]
+    assert start(shell, log).wait(120) == 0
+    wait_for(lambda: "best " in log.read_text(), 170, log)
+    assert count_done(optuna.load_study(study_name=NAME, storage=open_storage(storage, GRACE))) == N_TRIALS
+
+
+@pytest.mark.slow
 def test_a_stop_puts_running_trials_back(tmp_path: Path) -> None:
     log, storage = tmp_path / "tune.log", str(tmp_path / "study.log")
     process = start(command(tmp_path, storage, "--workers", "2"), log)
@@ -107,7 +120,7 @@ def test_a_stop_puts_running_trials_back(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         timeout=170,
-        env={**os.environ, "PYTHONPATH": str(HERE)},
+        env={**os.environ, "PYTHONPATH": MODULES},
     )
     assert done.returncode == 0, done.stderr
     assert count_done(study) == N_TRIALS
