@@ -58,10 +58,14 @@ def _add_fit(commands: Commands) -> None:
                      "delay30 or another delay; by default all of these")  # fmt: skip
     fit.add_argument("--actors", nargs="+", metavar="ACTOR", default=["paper", "lean", "lean,reflex", "mlp"],
                      help="paper: table A1's circuit; lean: the same with lean synapses; either with options after "
-                     "commas: reflex, full (fans), slow (command neurons), gains (of 6 to 12), inter=48, sub_steps=6, "
-                     "...; mlp: an MLP of as many parameters as table A1's circuit, mlp:64x64x64: these widths, "
-                     "mlp:1300: about 1300 parameters; gru:16: a GRU of 16 units; add a single learning rate as in "
-                     "lean,rate=3e-2. By default paper, lean, lean,reflex and mlp")  # fmt: skip
+                     "commas: reflex; full (fans); equal (neurons added, for as many parameters as paper has); "
+                     "slow (command neurons); gains (of 6 to 12); centred (logistics half open at the start); standard "
+                     "(inputs standardised); relative (positive quantities learnt by factors); unshunted (weak sensory "
+                     "synapses); inter=48, sub_steps=6, ...; rate_gains=3, rate_synapses=3, rate_readout=0.3 (factors "
+                     "of the rate). mlp: an MLP of as many parameters as table A1's circuit, mlp:64x64x64: these "
+                     "widths, mlp:1300: about 1300 parameters; gru:16: a GRU of 16 units. All with optimizer=nadam or "
+                     "radam, and with a single learning rate as in lean,rate=3e-2. By default paper, lean, lean,reflex "
+                     "and mlp")  # fmt: skip
     fit.add_argument("--steps", nargs="+", type=positive_int, default=[500, 1000, 2000, 8000], metavar="N",
                      help="Adam steps after which to measure the fit; by default 500, 1000, 2000 and 8000")  # fmt: skip
     fit.add_argument(
@@ -69,7 +73,8 @@ def _add_fit(commands: Commands) -> None:
     )
     fit.add_argument("--json", metavar="OUT", help=JSON_HELP)
     record = commands.add_parser("record", help="record the low level of a trained agent as a skill for fit")
-    record.add_argument("model", metavar="MODEL.zip", help="an agent whose low level is an MLP (hits, or no-ndbc)")
+    record.add_argument("model", type=model_path, metavar="MODEL.zip", help="an agent whose low level has no memory; "
+                        "pretrained:TASK is one that comes with the package")  # fmt: skip
     record.add_argument("--out", metavar="OUT.npz", help="by default the task's file among the package's skills")
     record.add_argument("--every", type=positive_int, default=3, help="record every N-th step", metavar="N")
     record.add_argument("--json", metavar="OUT", help=JSON_HELP)

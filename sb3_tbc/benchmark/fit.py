@@ -8,36 +8,32 @@ As in training, the averaged actor is evaluated.
 from __future__ import annotations
 
 import argparse
-import copy
-import itertools
+import math
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch as th
 from torch import nn
+from torch.func import functional_call, grad, vmap
+from torch.fx.experimental.proxy_tensor import make_fx
 
-from sb3_tbc.aliases import PlainMapping
-from sb3_tbc.benchmark.circuits import WIRING_NUMBERS, paper_numbers
+from sb3_tbc.benchmark.actors import Actor, count, parse_actor
+from sb3_tbc.benchmark.conditioning import group_of
 from sb3_tbc.benchmark.skills import Skill, load_skill, skill_names
-from sb3_tbc.errors import ConfigError
-from sb3_tbc.ndbc.network import NDBCNet
-from sb3_tbc.ndbc.wiring import NDBCWiring
 
-CIRCUIT_RATES = (1e-2, 3e-2, 1e-1, 3e-1)
-MLP_RATES = (1e-3, 3e-3, 1e-2, 3e-2)
 ROWS, SEQUENCES = 256, 32
 AVERAGE_DECAY = 0.995
 LARGEST_GRADIENT = 1.0
-MAX_WIDTH = 512
 
-
-class Actor(NamedTuple):
-    """A kind of network that can learn a skill."""
-
-    name: str
-    make: Callable[[Skill, int], nn.Module]  # from skill and seed
-    rates: tuple[float, ...]
+Weights = dict[str, th.Tensor]
+"""Parameters by name; with a first dimension for rates where there are several networks."""
+OPTIMIZERS: dict[str, Callable[..., th.optim.Optimizer]] = {
+    "adam": partial(th.optim.Adam, fused=True),
+    "nadam": th.optim.NAdam,
+    "radam": th.optim.RAdam,
+}
 
 
 class Result(NamedTuple):
@@ -50,151 +46,108 @@ class Result(NamedTuple):
     rates: dict[int, float]  # the best ones
 
 
-class Plain(nn.Module):
-    """A network without a state, with the interface of a circuit; a GRU is unrolled over the sequence."""
-
-    def __init__(self, network: nn.Module, readout: nn.Module | None = None) -> None:
-        super().__init__()
-        self.network, self.readout = network, readout
-
-    def forward(self, inputs: th.Tensor) -> tuple[th.Tensor, None]:
-        """Outputs, and no state."""
-        if self.readout is None:
-            return self.network(inputs), None
-        sequence = inputs if inputs.dim() == 3 else inputs.unsqueeze(1)
-        outputs = self.readout(self.network(sequence)[0])
-        return outputs if inputs.dim() == 3 else outputs[:, 0], None
-
-
-def parse_actor(text: str) -> Actor:
-    """An actor from its description.
-
-    ``paper`` is table A1's circuit, ``lean`` the same with lean synapses. Options follow after commas: ``reflex``;
-    ``full``, every fan as large as it can be; ``slow``, command neurons with time constants of 0.5 to 3 control steps;
-    ``gains``, initial gains of 6 to 12; any number of the wiring or option of the network as ``inter=48``; and
-    ``rate=3e-2``. ``mlp`` is an MLP of two hidden layers with as many parameters as table A1's circuit, ``mlp:24x14``
-    one with these widths, ``mlp:1300`` one with about 1300 parameters, and ``gru:16`` a GRU with 16 units.
-
-    :raises ConfigError: if the description is wrong
-    """
-    kind, *options = text.split(",")
-    name, _, size = kind.partition(":")
-    rates = tuple(float(o.partition("=")[2]) for o in options if o.startswith("rate="))
-    options = [o for o in options if not o.startswith("rate=")]
-    if name in ("paper", "lean") and not size:
-        values = {"synapses": name, **dict(_circuit_option(o, text) for o in options)}
-        return Actor(text, lambda skill, seed: make_circuit(skill, seed, values), rates or CIRCUIT_RATES)
-    if name == "mlp" and not options and all(w.isdigit() and int(w) > 0 for w in size.split("x") if size):
-        return Actor(text, lambda skill, seed: _make_mlp(skill, seed, size), rates or MLP_RATES)
-    if name == "gru" and not options and size.isdigit():
-        return Actor(text, lambda skill, seed: _make_gru(skill, seed, int(size)), rates or MLP_RATES)
-    raise ConfigError(f"no actor {text!r}: give paper or lean, mlp, mlp:24x14, mlp:1300 or gru:16, see --help")
-
-
-def _circuit_option(option: str, text: str) -> tuple[str, object]:
-    key, _, value = option.partition("=")
-    switches: dict[str, tuple[str, object]] = {
-        "reflex": ("sensory_to", ("inter", "command", "motor")),
-        "full": ("full", True),
-        "slow": ("time_constants", {"command": (0.5, 3.0)}),
-        "gains": ("initial_gains", (6.0, 12.0)),
-    }
-    if option in switches:
-        return switches[option]
-    if key not in (*WIRING_NUMBERS, "sub_steps", "readout") or not value:
-        raise ConfigError(f"unknown option {option!r} of actor {text!r}")
-    return key, int(value) if value.isdigit() else value
-
-
-def make_circuit(skill: Skill, seed: int, values: PlainMapping) -> NDBCNet:
-    """A circuit on table A1's wiring for the skill's task (Pendulum's for delays), with some of its numbers changed."""
-    given = dict(values)
-    numbers = {**paper_numbers(skill.name if not skill.name.startswith("delay") else "Pendulum")}
-    numbers["motor"] = max(numbers["motor"], skill.n_outputs)
-    numbers |= {key: given.pop(key) for key in WIRING_NUMBERS if key in given}
-    if given.pop("full", False):
-        fans = {"sensory_fanout": "inter", "inter_fanout": "command", "motor_fanin": "command"}
-        numbers |= {fan: numbers[layer] for fan, layer in fans.items()}
-    wiring = NDBCWiring(skill.n_inputs, **numbers, seed=seed, sensory_to=given.pop("sensory_to", ("inter",)))
-    return NDBCNet(skill.n_inputs, skill.n_outputs, wiring, seed=seed, **given)
-
-
-def _make_mlp(skill: Skill, seed: int, size: str) -> nn.Module:
-    if "x" in size:
-        return make_mlp(skill, seed, [int(w) for w in size.split("x")])
-    circuit = make_circuit(skill, 0, {"synapses": "paper"})
-    return make_mlp(skill, seed, equal_widths(skill, int(size) if size else count(circuit)))
-
-
-def make_mlp(skill: Skill, seed: int, widths: Sequence[int]) -> nn.Module:
-    """An MLP with ReLU and these hidden layers."""
-    th.manual_seed(seed)
-    sizes = (skill.n_inputs, *widths, skill.n_outputs)
-    layers: list[nn.Module] = []
-    for n_in, n_out in itertools.pairwise(sizes):
-        layers += [nn.Linear(n_in, n_out), nn.ReLU()]
-    return Plain(nn.Sequential(*layers[:-1]))
-
-
-def equal_widths(skill: Skill, parameters: int) -> tuple[int, int]:
-    """Two hidden widths that give an MLP about this many parameters, neither more than twice the other."""
-
-    def size(a: int, b: int) -> int:
-        return (skill.n_inputs + 1) * a + (a + 1) * b + (b + 1) * skill.n_outputs
-
-    pairs = ((a, b) for a in range(1, MAX_WIDTH) for b in range(max(1, a // 2), 2 * a + 1))
-    return min(itertools.takewhile(lambda p: size(p[0], 1) < 2 * parameters + 1000, pairs),
-               key=lambda p: abs(size(*p) - parameters))  # fmt: skip
-
-
-def _make_gru(skill: Skill, seed: int, units: int) -> nn.Module:
-    th.manual_seed(seed)
-    return Plain(nn.GRU(skill.n_inputs, units, batch_first=True), nn.Linear(units, skill.n_outputs))
-
-
-def count(network: nn.Module) -> int:
-    """Trained parameters."""
-    return sum(p.numel() for p in network.parameters() if p.requires_grad)
-
-
 @th.no_grad()
-def judge(network: nn.Module, skill: Skill) -> float:
-    """Share of the variance on later episodes that the network explains."""
-    error = (network(skill.later_inputs)[0] - skill.later_targets).square().sum()
+def judge(outputs: th.Tensor, skill: Skill) -> float:
+    """Share of the variance on later episodes that the outputs explain."""
+    error = (outputs - skill.later_targets).square().sum()
     around = (skill.later_targets - skill.later_targets.flatten(0, -2).mean(dim=0)).square().sum()
     return float(1.0 - error / around)
 
 
-def learn(network: nn.Module, skill: Skill, rate: float, steps: Sequence[int], seed: int = 0) -> dict[int, float]:
-    """R2 of the averaged network after each of the given numbers of Adam steps, at a constant rate."""
-    average = copy.deepcopy(network)
-    optimizer = th.optim.Adam(network.parameters(), lr=rate)
+def learn(actor: Actor, skill: Skill, steps: Sequence[int], seed: int = 0) -> dict[float, dict[int, float]]:
+    """R2 of the averaged network after each of the given numbers of steps, at each of the actor's constant rates.
+
+    The networks of all rates start alike, see the same batches, and learn side by side.
+    """
+    network = actor.make(skill, seed)
+    start = {name: p.detach() for name, p in network.named_parameters() if p.requires_grad}
+    weights = {name: th.stack([p] * len(actor.rates)) for name, p in start.items()}
+    average = {name: p.clone() for name, p in weights.items()}
+    update = _updater(actor, weights)
     generator = th.Generator().manual_seed(seed)
     batch = SEQUENCES if skill.inputs.dim() == 3 else ROWS
-    reached: dict[int, float] = {}
+    gradients = gradients_of(network, weights, skill.inputs[:batch], skill.targets[:batch])
+    reached: dict[float, dict[int, float]] = {rate: {} for rate in actor.rates}
     for step in range(1, max(steps) + 1):
         rows = th.randint(len(skill.inputs), (batch,), generator=generator)
-        loss = (network(skill.inputs[rows])[0] - skill.targets[rows]).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
-        optimizer.step()
+        update(gradients(weights, skill.inputs[rows], skill.targets[rows]))
         weight = 1.0 - min(AVERAGE_DECAY, (1 + step) / (10 + step))
-        with th.no_grad():
-            th._foreach_lerp_(list(average.parameters()), list(network.parameters()), weight)
+        th._foreach_lerp_(list(average.values()), list(weights.values()), weight)
         if step in steps:
-            reached[step] = judge(average, skill)
+            for i, rate in enumerate(actor.rates):
+                at = {name: p[i] for name, p in average.items()}
+                with th.no_grad():
+                    reached[rate][step] = judge(functional_call(network, at, (skill.later_inputs,))[0], skill)
     return reached
+
+
+def _updater(actor: Actor, weights: Weights) -> Callable[[Weights], None]:
+    """What takes a step of the actor's optimiser, in place, given the gradients."""
+    views = {(name, i): nn.Parameter(p[i]) for name, p in weights.items() for i in range(len(p))}
+    groups: dict[float, list[nn.Parameter]] = {}
+    for (name, i), view in views.items():
+        groups.setdefault(actor.rates[i] * actor.factors.get(group_of(name), 1.0), []).append(view)
+    optimizer = OPTIMIZERS[actor.optimizer]([{"params": views, "lr": rate} for rate, views in groups.items()])
+
+    def update(gradients: Weights) -> None:
+        for (name, i), view in views.items():
+            view.grad = gradients[name][i]
+        optimizer.step()
+
+    return update
+
+
+def gradients_of(
+    network: nn.Module, weights: Weights, inputs: th.Tensor, targets: th.Tensor
+) -> Callable[[Weights, th.Tensor, th.Tensor], Weights]:
+    """A function that gives the clipped gradients of several networks from their weights and a batch.
+
+    A single small network spends most of its time outside arithmetic. So where inputs are rows, all networks are traced
+    into one list of tensor operations. What is unrolled over time cannot be traced like this: one after the other.
+
+    :param network: gives the structure
+    :param weights: for each parameter ``(networks, ...)``
+    :param inputs: a batch of the size of all later ones
+    :param targets: its targets
+    """
+    buffers = dict(network.named_buffers())
+
+    def loss(one: Weights, x: th.Tensor, y: th.Tensor) -> th.Tensor:
+        outputs: th.Tensor = functional_call(network, {**one, **buffers}, (x,))[0]
+        return (outputs - y).square().mean()
+
+    def alone(weights: Weights, x: th.Tensor, y: th.Tensor) -> Weights:
+        found = []
+        for i in range(len(next(iter(weights.values())))):
+            one = {name: p[i].detach().requires_grad_() for name, p in weights.items()}
+            slopes = th.autograd.grad(loss(one, x, y), list(one.values()))
+            found.append(_clipped(dict(zip(one, slopes, strict=True))))
+        return {name: th.stack([each[name] for each in found]) for name in weights}
+
+    if inputs.dim() == 3 or any(isinstance(part, nn.RNNBase) for part in network.modules()):
+        return alone
+    together = vmap(lambda one, x, y: _clipped(grad(loss)(one, x, y)), in_dims=(0, None, None))
+    traced: Callable[[Weights, th.Tensor, th.Tensor], Weights] = make_fx(together)(weights, inputs, targets)
+    return traced
+
+
+def _clipped(gradients: Weights) -> Weights:
+    """The gradients of one network, scaled down where their norm is large."""
+    norm = th.stack([slope.square().sum() for slope in gradients.values()]).sum().sqrt()
+    scale = (LARGEST_GRADIENT / (norm + 1e-6)).clamp(max=1.0)
+    return {name: slope * scale for name, slope in gradients.items()}
 
 
 def best_of(actor: Actor, skill: Skill, steps: Sequence[int], seeds: Sequence[int]) -> Result:
     """R2 at the best of the actor's rates, for every number of steps; means over seeds."""
-    found: dict[float, dict[int, float]] = {}
+    runs = [learn(actor, skill, steps, seed) for seed in seeds]
+    found = {r: {step: sum(run[r][step] for run in runs) / len(runs) for step in steps} for r in actor.rates}
+
+    def order(step: int, rate: float) -> float:
+        return found[rate][step] if math.isfinite(found[rate][step]) else -math.inf  # a network may diverge
+
+    rates = {step: max(found, key=partial(order, step)) for step in steps}
     parameters = count(actor.make(skill, seeds[0]))
-    for rate in actor.rates:
-        runs = [learn(actor.make(skill, seed), skill, rate, steps, seed) for seed in seeds]
-        found[rate] = {step: sum(run[step] for run in runs) / len(runs) for step in steps}
-    rates = {step: max(found, key=lambda rate: found[rate][step]) for step in steps}
     return Result(skill.name, actor.name, parameters, {step: found[rates[step]][step] for step in steps}, rates)
 
 

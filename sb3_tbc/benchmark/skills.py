@@ -91,18 +91,19 @@ def delay_skill(steps: int, n_learnt: int = 2048, n_later: int = 256) -> Skill:
 def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[str, FloatArray]:
     """Record the inputs of an agent's low level while both levels act with noise, and the means of its actions.
 
-    :param model: a trained agent whose low level is an MLP: it has no memory, so its rows are independent
+    :param model: a trained agent whose low level has no memory, so that its rows are independent
     :param env: one environment of the agent's task
     :param every: record every n-th step, because neighbouring steps are very similar
     :param seed: seed of environment and noise
     :return: ``inputs`` divided by the circuit's fixed scales and ``means`` before squashing, float16, and ``learnt``,
         the number of rows to learn from: those of the first 85 % of the episodes
-    :raises ConfigError: if the low level is a circuit
+    :raises ConfigError: if the low level remembers
     """
     actor = model.low.policy.average_actor
-    if actor.state_dim:
+    if actor.state_dim and model.config.memory != "none":
         raise ConfigError(
-            "the low level of this agent is a circuit, whose actions depend on its memory; record an agent with an MLP"
+            f"the low level of this agent remembers (memory={model.config.memory!r}), so that its inputs alone do not "
+            "tell its actions; record an agent with memory='none' or with an MLP"
         )
     runner = TwoLevelRunner(env, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule)
     env.seed(seed)
@@ -116,7 +117,7 @@ def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[st
             ends.append(len(rows))
     seen = np.stack(rows)
     with th.no_grad():
-        means = actor.step(th.from_numpy(seen), th.zeros(len(seen), 0))[0].numpy()
+        means = actor.step(th.from_numpy(seen), th.zeros(len(seen), actor.state_dim))[0].numpy()
     scaled = seen / np.asarray(model.views.low_scale(), dtype=np.float32)
     learnt = max([end for end in ends if end <= 0.85 * n_rows], default=0)
     if not learnt:
