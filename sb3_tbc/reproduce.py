@@ -13,13 +13,13 @@ from pathlib import Path
 
 from sb3_tbc.campaign.campaign import Campaign
 from sb3_tbc.campaign.executors import Executor, LocalExecutor, RayExecutor, SlurmExecutor
-from sb3_tbc.campaign.hours import measured_speeds, plan
+from sb3_tbc.campaign.hours import plan, read_speeds
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
 from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
-from sb3_tbc.train import variant_name
+from sb3_tbc.train import N_EVAL_EPISODES, default_eval_freq, variant_name
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
 from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, ablations_of, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env, task_names
@@ -55,7 +55,7 @@ def build_parser() -> Parser:
     add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as in sb3_tbc.train")
     add("--n-timesteps", type=positive_int, help="environment steps of each run; by default the task's")
     add("--eval-freq", type=positive_int, help="steps between evaluations; by default a fortieth of the run")
-    add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (default: 20)")
+    add("--n-eval-episodes", type=positive_int, help=f"episodes of each evaluation (default: {N_EVAL_EPISODES})")
     add("--n-final-episodes", type=positive_int, default=100, help="episodes of the evaluation after training")
     add = parser.add_argument_group("how the runs are carried out").add_argument
     add("--workers", type=positive_int, default=1, help="runs at the same time, one thread each")
@@ -98,7 +98,14 @@ def _job(args: argparse.Namespace, algo: str, env: str, seed: int, ablation: str
     folder, target = (
         RunFolder.for_run(root.absolute(), task, algo, variant, seed) for root in (args.log_folder, args.ledger)
     )
-    return Job(algo, env, seed, folder, target, tuple(arguments), n_timesteps)
+    episodes = evaluated_episodes(args, n_timesteps)
+    return Job(algo, env, seed, folder, target, tuple(arguments), n_timesteps, episodes)
+
+
+def evaluated_episodes(args: argparse.Namespace, n_timesteps: int) -> int:
+    """Episodes of all evaluations of a run of so many steps."""
+    along = n_timesteps // (args.eval_freq or default_eval_freq(n_timesteps))
+    return int(along * (args.n_eval_episodes or N_EVAL_EPISODES) + args.n_final_episodes)
 
 
 def _shared(args: argparse.Namespace) -> list[str]:
@@ -134,7 +141,7 @@ def command(argv: Sequence[str]) -> int:
     todo = [job for job in campaign if not job.target.finished]
     print(f"{len(campaign)} runs, {len(campaign) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
     if args.dry_run:
-        print("\n".join(plan(todo, args.workers, measured_speeds(args.ledger), lambda job: job.name)))
+        print("\n".join(plan(todo, args.workers, read_speeds(args.ledger), lambda job: job.name)))
         return 0
     if not todo:
         return 0

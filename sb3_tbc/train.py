@@ -19,12 +19,14 @@ from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm
-from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, load_config, parse_overrides
+from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, OF_PAPER, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
 from sb3_tbc.zoo.settings_page import settings_text
 
+N_EVAL_EPISODES = 20
+"""Episodes of each evaluation along the curve, where nothing else is said."""
 EXAMPLES = {
     "sb3_tbc.train": "TBC-HRL on Pendulum; the run is kept in runs/Pendulum/tbc-hrl/full/seed_0",
     "sb3_tbc.train --list": "which tasks and algorithms there are, and how long a run takes",
@@ -62,7 +64,8 @@ def build_parser() -> Parser:
     watch = parser.add_argument_group("how it is evaluated")
     watch.add_argument("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a "
                        "fortieth of the run, at least 500")  # fmt: skip
-    watch.add_argument("--n-eval-episodes", type=positive_int, default=20, help="episodes of each evaluation")
+    watch.add_argument("--n-eval-episodes", type=positive_int, default=N_EVAL_EPISODES,
+                       help="episodes of each evaluation")  # fmt: skip
     watch.add_argument("--n-final-episodes", type=positive_int, default=100, help="episodes of the last evaluation")
     where = parser.add_argument_group("where it is kept")
     where.add_argument("--log-folder", type=Path, default=Path("runs"),
@@ -122,7 +125,7 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
         env_id,
         variant=args.variant or variant_name(args.ablation, config),
         seed=args.seed,
-        eval_freq=args.eval_freq or max(run.n_timesteps // 40, 500),
+        eval_freq=args.eval_freq or default_eval_freq(run.n_timesteps),
         n_eval_episodes=args.n_eval_episodes,
         n_final_episodes=args.n_final_episodes,
     )
@@ -143,9 +146,14 @@ def config_and_file(args: argparse.Namespace) -> tuple[str | None, Path | None]:
     return None, path
 
 
+def default_eval_freq(n_timesteps: int) -> int:
+    """Environment steps between two evaluations of a run of so many steps."""
+    return max(n_timesteps // 40, 500)
+
+
 def variant_name(ablation: str | None, config: str | None) -> str:
     """Folder name of a variant: ``full`` or the ablation, with ``-paper`` when the tables' values were asked for."""
-    return (ablation or "full") + ("-paper" if config == "paper" else "")
+    return (ablation or "full") + (OF_PAPER if config == "paper" else "")
 
 
 def describe(result: Plain, folder: RunFolder) -> str:

@@ -1,37 +1,81 @@
-"""How long runs will take, from the speeds of those that are finished."""
+"""How long runs will take: from measured speeds of training and of evaluation, else from those of finished runs."""
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from statistics import median
+from statistics import fmean, median
+from typing import NamedTuple
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.campaign.jobs import Job
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.reading import read_yaml
+from sb3_tbc.zoo.config import OF_PAPER
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import finished_runs
 
-Speeds = dict[tuple[str, str], float]
-"""Task and algorithm, or task and an empty text for all of its algorithms -> environment steps per second."""
+SPEEDS = "speeds.yml"
+"""In the ledger: task -> method -> ``train`` and ``evaluate``, environment steps per second of one core without the
+other; ``scripts/speeds.py`` measures them."""
+
+Rows = dict[tuple[str, str], float]
+"""Task and method, or task and an empty text for all of its methods -> a figure."""
 
 
-def measured_speeds(ledger: Path) -> Speeds:
-    """Median environment steps per second of finished runs, per task and algorithm and per task."""
-    found: dict[tuple[str, str], list[float]] = defaultdict(list)
+class Speeds(NamedTuple):
+    """What is known of the speed of each task and method."""
+
+    train: Rows  # environment steps per second of training alone
+    evaluate: Rows  # of evaluations alone
+    episode: Rows  # mean steps of an evaluated episode
+    whole: Rows  # of finished runs, evaluations included, in which other settings may have been in force
+
+
+def read_speeds(ledger: Path) -> Speeds:
+    """Measured speeds of a ledger.
+
+    :raises ConfigError: if ``speeds.yml`` cannot be read
+    """
+    train: Rows = {}
+    evaluate: Rows = {}
+    path = ledger / SPEEDS
+    try:
+        for task, methods in (read_yaml(path) if path.is_file() else {}).items():
+            for method, row in methods.items():
+                train[task, method], evaluate[task, method] = float(row["train"]), float(row["evaluate"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path} must have task: method: {{train: ..., evaluate: ...}}; got {error!r}") from error
+    return Speeds(train, evaluate, *_of_finished_runs(ledger))
+
+
+def _of_finished_runs(ledger: Path) -> tuple[Rows, Rows]:
+    """Mean length of evaluated episodes, and median environment steps per second."""
+    lengths: dict[tuple[str, str], list[float]] = defaultdict(list)
+    speeds: dict[tuple[str, str], list[float]] = defaultdict(list)
     for folder in finished_runs(ledger):
         final: Plain = folder.read_final()
-        speed = final.get("steps_per_second")
-        if isinstance(speed, int | float) and speed > 0:
-            for key in ((str(final["task"]), str(final["algo"])), (str(final["task"]), "")):
-                found[key].append(float(speed))
-    return {key: median(speeds) for key, speeds in found.items()}
+        speed, rows = final.get("steps_per_second"), folder.read_evaluations()
+        for key in ((str(final["task"]), str(final["algo"])), (str(final["task"]), "")):
+            if isinstance(speed, int | float) and speed > 0:
+                speeds[key].append(float(speed))
+            if rows:
+                lengths[key].append(fmean(row.mean_length for row in rows))
+    return {key: fmean(found) for key, found in lengths.items()}, {key: median(found) for key, found in speeds.items()}
 
 
 def hours_of(job: Job, speeds: Speeds) -> float | None:
-    """Hours that a run takes; ``None`` if the ledger has no run of its task."""
+    """Hours that a run takes; ``None`` if nothing is known of its task."""
     task, _ = resolve_env(job.env)
-    speed = speeds.get((task, job.algo)) or speeds.get((task, ""))
+    of_paper = [f"{job.algo} full{OF_PAPER}"] if job.variant.endswith(OF_PAPER) else []
+    methods = [f"{job.algo} {job.variant}", *of_paper, job.algo]
+    key = next(((task, method) for method in methods if (task, method) in speeds.train), None)
+    if key is not None:
+        length = speeds.episode.get((task, job.algo)) or speeds.episode.get((task, "")) or 0.0
+        seconds = job.n_timesteps / speeds.train[key] + job.n_episodes * length / speeds.evaluate[key]
+        return seconds / 3600
+    speed = speeds.whole.get((task, job.algo)) or speeds.whole.get((task, ""))
     return job.n_timesteps / speed / 3600 if speed else None
 
 
@@ -43,7 +87,7 @@ def plan(todo: Sequence[Job], workers: int, speeds: Speeds, name: Callable[[Job]
         for job, h in zip(todo, hours, strict=True)
     ]
     known = [h for h in hours if h is not None]
-    total = f"{len(todo)} runs, {sum(known):.1f} hours of one core at the speeds of the ledger's finished runs"
+    total = f"{len(todo)} runs, {sum(known):.1f} hours of one core at measured speeds, evaluations included"
     total += f"; about {sum(known) / workers:.1f} hours with {workers} at a time" if workers > 1 else ""
     unknown = len(hours) - len(known)
     return [*lines, total + (f"; {unknown} runs of unknown length" if unknown else "")]

@@ -26,6 +26,7 @@ class Job:
     :param target: its place in the ledger
     :param arguments: for ``python -m sb3_tbc.train``
     :param n_timesteps: environment steps of the run
+    :param n_episodes: episodes of all its evaluations together
     :param cwd: working directory of the command; folders in ``arguments`` are relative to it
     """
 
@@ -36,12 +37,18 @@ class Job:
     target: RunFolder
     arguments: tuple[str, ...]
     n_timesteps: int = 0
+    n_episodes: int = 0
     cwd: Path = field(default_factory=Path.cwd)
 
     @property
     def name(self) -> str:
         """For messages."""
-        return f"{self.env} {self.algo} {self.folder.path.parent.name} seed {self.seed}"
+        return f"{self.env} {self.algo} {self.variant} seed {self.seed}"
+
+    @property
+    def variant(self) -> str:
+        """Name of the run's settings, as its folder has it."""
+        return self.folder.path.parent.name
 
     @property
     def log(self) -> Path:
@@ -70,7 +77,7 @@ class Job:
         attempts = _attempts(record)
         text = self.log.read_text(encoding="utf-8", errors="replace").strip() if self.log.is_file() else ""
         last = text.splitlines()[-1] if text else ""
-        row = {"task": self.env, "algo": self.algo, "variant": self.folder.path.parent.name, "seed": self.seed}
+        row = {"task": self.env, "algo": self.algo, "variant": self.variant, "seed": self.seed}
         write_atomic(record, to_json({**row, "exit_status": status, "attempts": attempts + 1, "message": last}))
         return last
 

@@ -9,8 +9,17 @@ import numpy as np
 
 from sb3_tbc import stats
 from sb3_tbc.report.conditions import differences
-from sb3_tbc.report.runs import OURS, Results, Run, is_shipped, on_union_of_steps, shipped, successes
-from sb3_tbc.zoo.config import ABLATIONS
+from sb3_tbc.report.runs import (
+    OURS,
+    Results,
+    Run,
+    is_shipped,
+    on_union_of_steps,
+    reference_of,
+    shipped,
+    successes,
+)
+from sb3_tbc.zoo.config import ABLATIONS, OF_PAPER
 
 BLOCK = 10
 """Episodes in a block of the paired bootstrap: the number of episodes that are evaluated in parallel."""
@@ -40,7 +49,7 @@ class Gain(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One comparison of ours with another row of a task."""
+    """One comparison of ours, with shipped settings or the paper's, with another row of a task."""
 
     task: str
     other: str
@@ -130,12 +139,12 @@ def _rows(results: Results, others: Mapping[str, Sequence[str]]) -> list[Row]:
     """Compare ours with named rows of each task; the p-values are corrected over all of them."""
     keys = [(task, name) for task, names in others.items() for name in names]
     tests = stats.compare(
-        {key: successes(results[key[0]][OURS]) for key in keys},
+        {key: successes(results[key[0]][reference_of(key[1])]) for key in keys},
         {key: successes(results[key[0]][key[1]]) for key in keys},
     )
     rows = []
     for task, name in keys:
-        ours, theirs = results[task][OURS], results[task][name]
+        ours, theirs = results[task][reference_of(name)], results[task][name]
         gain = convergence_gain(ours, theirs, common_threshold(results[task]))
         strongest = name in strongest_baselines(results[task])
         unequal = tuple(differences(theirs, ours))
@@ -149,7 +158,7 @@ def against_baselines(results: Results) -> list[Row]:
 
 
 def against_ablations(results: Results) -> list[Row]:
-    """Ours against its own ablations (table 3)."""
-    names = [f"{OURS} {ablation}" for ablation in sorted(ABLATIONS)]
-    found = {t: [n for n in names if n in methods] for t, methods in results.items() if OURS in methods}
+    """Ours against its own ablations (table 3): of the shipped settings, and of the paper's."""
+    names = [f"{OURS} {ablation}{config}" for config in ("", OF_PAPER) for ablation in sorted(ABLATIONS)]
+    found = {t: [n for n in names if n in methods and reference_of(n) in methods] for t, methods in results.items()}
     return _rows(results, found)

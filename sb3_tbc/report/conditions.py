@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from sb3_tbc.report.runs import OURS, Results, Run, shipped
+from sb3_tbc.report.runs import OURS, Results, Run, reference_of, shipped
 
 TWO_LEVELS = ("tbc-hrl", "hits", "hac")
 
@@ -93,9 +93,11 @@ def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]]) ->
     """Notes on a single row: unequal conditions, and code that differs from its commit.
 
     :param runs: runs of the row
-    :param reference: all rows of the task; ours is the one to compare with
+    :param reference: all rows of the task; ours is the one to compare with, for ablations of the paper's settings that
+        with these settings
     """
-    notes = differences(runs, reference[OURS]) if OURS in reference else []
+    other = reference_of(runs[0].method)
+    notes = differences(runs, reference[other]) if other in reference else []
     if any(run.tuned_on for run in runs):
         notes.append("settings were chosen on the seed that is reported")
     dirty = [run.seed for run in runs if run.versions and run.dirty]

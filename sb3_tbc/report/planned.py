@@ -9,9 +9,11 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import read_yaml
 from sb3_tbc.report.runs import SHIPPED, Results
+from sb3_tbc.zoo.config import OF_PAPER
 
 CAMPAIGN = "campaign.yml"
-"""In the folder of results: ``first_seed``, ``options`` of every command, and ``runs`` with task, methods, seeds."""
+"""In the folder of results: ``first_seed``, ``options`` of every command, and ``runs`` with task, methods, seeds, and
+``first_seed`` and ``options`` of their own."""
 
 
 def missing_table(root: Path, results: Results) -> list[list[str]]:
@@ -25,8 +27,9 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
         return table
     try:
         plan = read_yaml(path)
-        first = int(plan["first_seed"])
+        _check_equal_options(plan)
         for row in plan["runs"]:
+            first = _first_seed(plan, row)
             for method in row["methods"]:
                 wanted = set(range(first, first + int(row["seeds"])))
                 done = wanted & {run.seed for run in results.get(row["task"], {}).get(method, [])}
@@ -38,13 +41,35 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
     return table
 
 
+def _first_seed(plan: Plain, row: Plain) -> int:
+    return int(row.get("first_seed", plan["first_seed"]))
+
+
+def _options(plan: Plain, row: Plain) -> list[str]:
+    return [str(word) for word in row.get("options", plan.get("options", []))]
+
+
+def _check_equal_options(plan: Plain) -> None:
+    """Refuse a plan in which methods of one task would be evaluated in different ways.
+
+    :raises ConfigError: naming the task
+    """
+    first: dict[str, list[str]] = {}
+    for row in plan["runs"]:
+        options = first.setdefault(str(row["task"]), _options(plan, row))
+        if options != _options(plan, row):
+            raise ConfigError(
+                f"rows of {row['task']} have different options, {shlex.join(options)!r} and "
+                f"{shlex.join(_options(plan, row))!r}; all methods of a task must be evaluated alike"
+            )
+
+
 def _command(plan: Plain, row: Plain, method: str) -> str:
     algo, _, variant = method.partition(" ")
     words = ["python", "-m", "sb3_tbc.reproduce", "--tasks", row["task"], "--algos", algo]
-    words += ["--first-seed", str(plan["first_seed"]), "--seeds", str(row["seeds"])]
-    if variant == f"{SHIPPED}-paper":
-        words += ["--config", "paper"]
-    elif variant:
-        words += ["--ablation", variant]
+    words += ["--first-seed", str(_first_seed(plan, row)), "--seeds", str(row["seeds"])]
+    ablation, paper = variant.removesuffix(OF_PAPER), variant.endswith(OF_PAPER)
+    words += ["--config", "paper"] if paper else []
+    words += ["--ablation", ablation] if ablation not in ("", SHIPPED) else []
     words += ["--n-timesteps", str(row["n_timesteps"])] if "n_timesteps" in row else []
-    return shlex.join([*words, *map(str, plan.get("options", []))])
+    return shlex.join([*words, *_options(plan, row)])

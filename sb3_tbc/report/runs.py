@@ -17,6 +17,7 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json, read_text, read_yaml
 from sb3_tbc.report.checked import check_final, check_sections
 from sb3_tbc.zoo.callbacks import EvaluationRow
+from sb3_tbc.zoo.config import OF_PAPER
 from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
 
 OURS = "tbc-hrl"
@@ -152,6 +153,13 @@ def is_shipped(method: str) -> bool:
 def shipped(methods: Mapping[str, Sequence[Run]]) -> dict[str, Sequence[Run]]:
     """The rows with shipped settings: ours and the baselines, no variant and no ablation."""
     return {method: runs for method, runs in methods.items() if is_shipped(method)}
+
+
+def reference_of(method: str) -> str:
+    """The row of ours that a row is to be compared with: an ablation of the paper's settings with those settings."""
+    algo, _, variant = method.partition(" ")
+    of_paper = algo == OURS and variant.endswith(OF_PAPER)
+    return f"{OURS} {SHIPPED}{OF_PAPER}" if of_paper and variant != SHIPPED + OF_PAPER else OURS
 
 
 def successes(runs: Sequence[Run]) -> list[float]:

@@ -10,7 +10,7 @@ from sb3_tbc import stats
 from sb3_tbc.report.comparisons import Row, against_ablations, against_baselines, interval_of
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.paper import Paper
-from sb3_tbc.report.runs import Results, Run, describe, shipped, successes
+from sb3_tbc.report.runs import OURS, Results, Run, describe, reference_of, shipped, successes
 
 Table = list[list[str]]
 Descriptions = Mapping[str, Mapping[str, str]]
@@ -100,7 +100,9 @@ def comparison_table(rows: Sequence[Row]) -> Table:
         gain = "-" if row.gain is None else str(row.gain)
         interval = f"{row.interval.low:+.3f} to {row.interval.high:+.3f}"
         unequal = f"unequal {'; '.join(row.unequal)}" if row.unequal else ""
-        note = ", ".join(filter(None, [test.note, "strongest baseline" if row.strongest else "", unequal]))
+        reference = reference_of(row.other)
+        than = "" if reference == OURS else f"ours is {reference}"
+        note = ", ".join(filter(None, [than, test.note, "strongest baseline" if row.strongest else "", unequal]))
         numbers = [f"{test.difference:+.3f}", *tested, test.mark, effects[0], gain, interval, effects[1]]
         table.append([row.task, row.other, *numbers, note])
     return table

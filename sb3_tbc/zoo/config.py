@@ -15,6 +15,8 @@ from sb3_tbc.tbc_hrl.config import TBCConfig
 from sb3_tbc.zoo.schema import RUN, coerce, validate
 
 CONFIGS = ("paper", "tuned")
+OF_PAPER = "-paper"
+"""Ends the names of variants that have the values of the paper's tables."""
 OTHER = "other"
 """Section of configuration files for environments that have none of their own."""
 PARTS: dict[str, tuple[Plain, Plain]] = {

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,7 @@ from rich.console import Console
 from sb3_tbc.campaign import campaign as campaigns
 from sb3_tbc.campaign.campaign import Campaign
 from sb3_tbc.campaign.executors import LocalExecutor, SlurmExecutor, run_job
-from sb3_tbc.campaign.hours import hours_of, measured_speeds, plan
+from sb3_tbc.campaign.hours import hours_of, plan, read_speeds
 from sb3_tbc.campaign.jobs import FAILED, Job
 from sb3_tbc.campaign.progress import Board
 from sb3_tbc.errors import ConfigError
@@ -293,13 +294,12 @@ def test_without_a_slurm_cluster_it_is_one_line(tmp_path: Path, monkeypatch: pyt
         SlurmExecutor(tmp_path / "slurm", {"no_such_setting": 1}, cluster="local")
 
 
-def test_hours_from_measured_speeds(tmp_path: Path) -> None:
+def test_hours_from_finished_runs(tmp_path: Path) -> None:
     for seed, speed in enumerate((100.0, 200.0, 1000.0)):
         folder = RunFolder.for_run(tmp_path / "results", "Pendulum", "hits", "full", seed)
         folder.start({}, "x")
         folder.finish({"task": "Pendulum", "algo": "hits", "variant": "full", "steps_per_second": speed})
-    speeds = measured_speeds(tmp_path / "results")
-    assert speeds["Pendulum", "hits"] == 200.0
+    speeds = read_speeds(tmp_path / "results")
     job = make_job(tmp_path, 9)
     assert hours_of(job, speeds) == pytest.approx(1000 / 200 / 3600)
     unknown = make_job(tmp_path, 9, env="Drawbridge")
@@ -309,3 +309,27 @@ def test_hours_from_measured_speeds(tmp_path: Path) -> None:
     assert lines[1].endswith("hours unknown")
     assert "with 2 at a time" in lines[2]
     assert lines[2].endswith("1 runs of unknown length")
+
+
+def test_hours_from_measured_speeds_with_evaluations(tmp_path: Path) -> None:
+    ledger = tmp_path / "results"
+    folder = RunFolder.for_run(ledger, "Pendulum", "hits", "full", 0)
+    folder.start({}, "x")
+    header = "timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,wall_time\n"
+    folder.evaluations.write_text(header + "500,0,4,200,0.5,4,1\n1000,1,4,100,0.5,4,2\n")
+    folder.finish({"task": "Pendulum", "algo": "hits", "variant": "full", "steps_per_second": 1e6})
+    rows = "hits: {train: 10, evaluate: 300}, hits full-paper: {train: 5, evaluate: 300}"
+    (ledger / "speeds.yml").write_text(f"Pendulum: {{{rows}, hits no-ts: {{train: 1, evaluate: 300}}}}")
+    speeds = read_speeds(ledger)
+    job = replace(make_job(tmp_path), n_episodes=20)
+    assert hours_of(job, speeds) == pytest.approx((1000 / 10 + 20 * 150 / 300) / 3600)
+    seconds = {}
+    for variant in ("full-paper", "with-memory-paper", "no-ts", "with-memory"):
+        folder = RunFolder.for_run(tmp_path, "Pendulum", "hits", variant, 0)
+        seconds[variant] = 3600 * (hours_of(replace(job, folder=folder), speeds) or 0.0)
+    expected = {"full-paper": 210, "with-memory-paper": 210, "no-ts": 1010, "with-memory": 110}
+    assert seconds == pytest.approx(expected)
+    assert hours_of(replace(job, algo="sac"), speeds) == pytest.approx(1000 / 1e6 / 3600)  # of its task only
+    (ledger / "speeds.yml").write_text("Pendulum: 3")
+    with pytest.raises(ConfigError, match=r"speeds\.yml must have"):
+        read_speeds(ledger)

@@ -238,6 +238,48 @@ def test_tuning_seeds_are_left_out_or_named(tmp_path: Path) -> None:
     assert notes_of_row(methods["tbc-hrl"], methods) == []
 
 
+def test_ablations_of_the_papers_settings_are_compared_with_these(tmp_path: Path) -> None:
+    for variant, rate, ratio in (("full", 1.0, 0.5), ("full-paper", 0.6, 1.0), ("no-ts", 0.7, 0.5)):
+        fake_run(tmp_path, "A", "tbc-hrl", 0, rate, variant, config={"model": {"gradient_ratio": ratio}})
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4, "no-ts-paper", config={"model": {"gradient_ratio": 1.0}})
+    results = load_results(tmp_path)
+    rows = {row.other: row for row in against_ablations(results)}
+    assert rows["tbc-hrl no-ts"].interval.mean == pytest.approx(0.3)
+    assert rows["tbc-hrl no-ts-paper"].test.difference == pytest.approx(0.2)
+    assert rows["tbc-hrl no-ts-paper"].interval.mean == pytest.approx(0.2)
+    assert rows["tbc-hrl no-ts-paper"].unequal == ()
+    notes = {line[1]: line[-1] for line in tables.comparison_table(list(rows.values()))}
+    assert notes["tbc-hrl no-ts-paper"] == "ours is tbc-hrl full-paper, fewer than three seeds"
+    assert notes["tbc-hrl no-ts"] == "fewer than three seeds"
+    methods = results["A"]
+    assert notes_of_row(methods["tbc-hrl no-ts-paper"], methods) == []
+    assert notes_of_row(methods["tbc-hrl full-paper"], methods) == ["updates per step: 1.0 (0.5)"]
+
+
+def test_ablations_of_the_papers_settings_need_these(tmp_path: Path) -> None:
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4, "no-ts-paper")
+    assert against_ablations(load_results(tmp_path)) == []
+
+
+def test_rows_of_a_plan_may_have_options_of_their_own(tmp_path: Path) -> None:
+    fake_run(tmp_path, "Pendulum", "tbc-hrl", 100, 1.0)
+    own = "first_seed: 102, options: [--n-eval-episodes, 20]"
+    rows = f"{{task: Pendulum, seeds: 1, {own}, methods: [tbc-hrl, tbc-hrl no-ts-paper]}}"
+    rows += ", {task: Drawbridge, seeds: 1, methods: [tbc-hrl]}"
+    plan = tmp_path / "campaign.yml"
+    plan.write_text(f"first_seed: 100\noptions: [--n-eval-episodes, 100]\nruns: [{rows}]")
+    commands = [row[3] for row in missing_table(tmp_path, load_results(tmp_path))[1:]]
+    planned = [job for command in commands for job in jobs(shlex.split(command)[3:])]
+    assert [job.seed for job in planned] == [102, 102, 100]
+    assert [job.n_episodes for job in planned] == [40 * 20 + 100, 40 * 20 + 100, 40 * 100 + 100]
+    assert [job.variant for job in planned] == ["full", "no-ts-paper", "full"]
+    assert {"--ablation", "no-ts", "--config", "paper"} <= set(planned[1].arguments)
+    plan.write_text(f"first_seed: 100\nruns: [{rows}, {{task: Pendulum, seeds: 1, methods: [hits]}}]")
+    with pytest.raises(ConfigError, match="all methods of a task must be evaluated alike"):
+        missing_table(tmp_path, load_results(tmp_path))
+
+
 def test_missing_runs_come_with_a_command_that_is_understood(tmp_path: Path) -> None:
     for seed in (0, 100):
         fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0)
