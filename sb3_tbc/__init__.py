@@ -1,6 +1,6 @@
 """Hierarchical reinforcement learning with timed subgoals and bionic circuit networks, on Stable-Baselines3."""
 
-from sb3_tbc import former_names
+from sb3_tbc import former_names, interruption  # noqa: F401  (an interruption of the imports below)
 from sb3_tbc.hub import load_from_hub, push_to_hub
 from sb3_tbc.ndbc import NDBCNet, NDBCWiring
 from sb3_tbc.pretrained import load_pretrained

@@ -15,7 +15,7 @@ PACKAGE = ROOT / "sb3_tbc"
 
 # From bottom to top: a folder (or a module beside the folders) imports from itself and from lower layers alone.
 LAYERS = (
-    ("aliases", "former_names", "errors", "stats", "arrays"),
+    ("aliases", "former_names", "interruption", "errors", "stats", "arrays"),
     ("files", "outside", "stopping", "settings"),
     ("reading",),
     ("commands", "extras", "smdp"),

@@ -14,7 +14,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import read_yaml
 from sb3_tbc.zoo.config import OF_PAPER
 from sb3_tbc.zoo.environments import resolve_env
-from sb3_tbc.zoo.ledger import finished_runs
+from sb3_tbc.zoo.ledger import RunFolder, finished_runs
 
 SPEEDS = "speeds.yml"
 """In the ledger: task -> method -> ``train`` and ``evaluate``, environment steps per second of one core without the
@@ -56,13 +56,22 @@ def _of_finished_runs(ledger: Path) -> tuple[Rows, Rows]:
     speeds: dict[tuple[str, str], list[float]] = defaultdict(list)
     for folder in finished_runs(ledger):
         final: Plain = folder.read_final()
-        speed, rows = final.get("steps_per_second"), folder.read_evaluations()
-        for key in ((str(final["task"]), str(final["algo"])), (str(final["task"]), "")):
+        speed, length = final.get("steps_per_second"), _mean_length(folder)
+        for key in ((str(final.get("task")), str(final.get("algo"))), (str(final.get("task")), "")):
             if isinstance(speed, int | float) and speed > 0:
                 speeds[key].append(float(speed))
-            if rows:
-                lengths[key].append(fmean(row.mean_length for row in rows))
+            if length is not None:
+                lengths[key].append(length)
     return {key: fmean(found) for key, found in lengths.items()}, {key: median(found) for key, found in speeds.items()}
+
+
+def _mean_length(folder: RunFolder) -> float | None:
+    """Mean steps of a run's evaluated episodes; a curve that cannot be read, which a report refuses, counts as none."""
+    try:
+        rows = folder.read_evaluations()
+    except ConfigError:
+        return None
+    return fmean(row.mean_length for row in rows) if rows else None
 
 
 def hours_of(job: Job, speeds: Speeds) -> float | None:

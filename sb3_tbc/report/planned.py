@@ -42,11 +42,11 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
 
 
 def _first_seed(plan: Plain, row: Plain) -> int:
-    return int(row.get("first_seed", plan["first_seed"]))
+    return int((row if "first_seed" in row else plan)["first_seed"])
 
 
 def _options(plan: Plain, row: Plain) -> list[str]:
-    return [str(word) for word in row.get("options", plan.get("options", []))]
+    return [str(word) for word in (row if "options" in row else plan).get("options") or ()]
 
 
 def _check_equal_options(plan: Plain) -> None:
