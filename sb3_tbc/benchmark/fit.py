@@ -36,26 +36,45 @@ OPTIMIZERS: dict[str, Callable[..., th.optim.Optimizer]] = {
 }
 
 
+class Fit(NamedTuple):
+    """R2 on rows of later episodes, and on rows that were learnt from."""
+
+    later: float
+    learnt: float
+
+
 class Result(NamedTuple):
     """Quality of an actor's fit to a skill."""
 
     skill: str
     actor: str
     parameters: int
-    r2: dict[int, float]  # by Adam steps, each at its best rate
+    r2: dict[int, float]  # on later episodes, by Adam steps, each at its best rate
     rates: dict[int, float]  # the best ones
+    r2_learnt: dict[int, float]  # at the same rates, on rows that were learnt from
 
 
-@th.no_grad()
-def judge(outputs: th.Tensor, skill: Skill) -> float:
-    """Share of the variance on later episodes that the outputs explain."""
-    error = (outputs - skill.later_targets).square().sum()
-    around = (skill.later_targets - skill.later_targets.flatten(0, -2).mean(dim=0)).square().sum()
+def explained(outputs: th.Tensor, targets: th.Tensor) -> float:
+    """Share of the targets' variance that the outputs explain."""
+    error = (outputs - targets).square().sum()
+    around = (targets - targets.flatten(0, -2).mean(dim=0)).square().sum()
     return float(1.0 - error / around)
 
 
-def learn(actor: Actor, skill: Skill, steps: Sequence[int], seed: int = 0) -> dict[float, dict[int, float]]:
-    """R2 of the averaged network after each of the given numbers of steps, at each of the actor's constant rates.
+@th.no_grad()
+def judge(network: nn.Module, weights: Weights, skill: Skill) -> Fit:
+    """How well a network fits, on as many rows learnt from as there are later ones.
+
+    :param network: gives the structure
+    :param weights: its parameters
+    """
+    rows = th.linspace(0, len(skill.inputs) - 1, len(skill.later_inputs)).long()
+    pairs = ((skill.later_inputs, skill.later_targets), (skill.inputs[rows], skill.targets[rows]))
+    return Fit(*(explained(functional_call(network, weights, (x,))[0], y) for x, y in pairs))
+
+
+def learn(actor: Actor, skill: Skill, steps: Sequence[int], seed: int = 0) -> dict[float, dict[int, Fit]]:
+    """How well the averaged network fits after the given numbers of steps, at each of the actor's constant rates.
 
     The networks of all rates start alike, see the same batches, and learn side by side.
     """
@@ -67,7 +86,7 @@ def learn(actor: Actor, skill: Skill, steps: Sequence[int], seed: int = 0) -> di
     generator = th.Generator().manual_seed(seed)
     batch = SEQUENCES if skill.inputs.dim() == 3 else ROWS
     gradients = gradients_of(network, weights, skill.inputs[:batch], skill.targets[:batch])
-    reached: dict[float, dict[int, float]] = {rate: {} for rate in actor.rates}
+    reached: dict[float, dict[int, Fit]] = {rate: {} for rate in actor.rates}
     for step in range(1, max(steps) + 1):
         rows = th.randint(len(skill.inputs), (batch,), generator=generator)
         update(gradients(weights, skill.inputs[rows], skill.targets[rows]))
@@ -75,9 +94,7 @@ def learn(actor: Actor, skill: Skill, steps: Sequence[int], seed: int = 0) -> di
         th._foreach_lerp_(list(average.values()), list(weights.values()), weight)
         if step in steps:
             for i, rate in enumerate(actor.rates):
-                at = {name: p[i] for name, p in average.items()}
-                with th.no_grad():
-                    reached[rate][step] = judge(functional_call(network, at, (skill.later_inputs,))[0], skill)
+                reached[rate][step] = judge(network, {name: p[i] for name, p in average.items()}, skill)
     return reached
 
 
@@ -141,14 +158,21 @@ def _clipped(gradients: Weights) -> Weights:
 def best_of(actor: Actor, skill: Skill, steps: Sequence[int], seeds: Sequence[int]) -> Result:
     """R2 at the best of the actor's rates, for every number of steps; means over seeds."""
     runs = [learn(actor, skill, steps, seed) for seed in seeds]
-    found = {r: {step: sum(run[r][step] for run in runs) / len(runs) for step in steps} for r in actor.rates}
+    found = {rate: {step: _mean([run[rate][step] for run in runs]) for step in steps} for rate in actor.rates}
 
     def order(step: int, rate: float) -> float:
-        return found[rate][step] if math.isfinite(found[rate][step]) else -math.inf  # a network may diverge
+        later = found[rate][step].later
+        return later if math.isfinite(later) else -math.inf  # a network may diverge
 
     rates = {step: max(found, key=partial(order, step)) for step in steps}
+    best = {step: found[rates[step]][step] for step in steps}
     parameters = count(actor.make(skill, seeds[0]))
-    return Result(skill.name, actor.name, parameters, {step: found[rates[step]][step] for step in steps}, rates)
+    later, learnt = ({step: fit[i] for step, fit in best.items()} for i in range(2))
+    return Result(skill.name, actor.name, parameters, later, rates, learnt)
+
+
+def _mean(fits: Sequence[Fit]) -> Fit:
+    return Fit(*(sum(values) / len(fits) for values in zip(*fits, strict=True)))
 
 
 def fit(arguments: argparse.Namespace) -> tuple[list[str], dict[str, object]]:
@@ -157,10 +181,11 @@ def fit(arguments: argparse.Namespace) -> tuple[list[str], dict[str, object]]:
     steps = sorted(arguments.steps)
     actors = [parse_actor(text) for text in arguments.actors]
     lines = [
-        "R2 on later episodes after Adam steps, at the best rate (in brackets) of each actor's grid",
+        "R2 on later episodes after Adam steps, at the best rate (in brackets) of each actor's grid; last column:",
+        "R2 after the last steps on rows that were learnt from, for comparison",
         "",
-        f"| skill | actor | parameters | {' | '.join(str(step) for step in steps)} |",
-        "|---" * (3 + len(steps)) + "|",
+        f"| skill | actor | parameters | {' | '.join(str(step) for step in steps)} | learnt from |",
+        "|---" * (4 + len(steps)) + "|",
     ]
     results = []
     for name in arguments.tasks or skill_names():
@@ -168,7 +193,9 @@ def fit(arguments: argparse.Namespace) -> tuple[list[str], dict[str, object]]:
         for actor in actors:
             result = best_of(actor, skill, steps, range(arguments.seeds))
             figures = " | ".join(f"{result.r2[step]:.3f} ({result.rates[step]:g})" for step in steps)
-            lines.append(f"| {name} | {actor.name} | {result.parameters} | {figures} |")
+            lines.append(
+                f"| {name} | {actor.name} | {result.parameters} | {figures} | {result.r2_learnt[steps[-1]]:.3f} |"
+            )
             print(lines[-1], file=sys.stderr, flush=True)  # a table may take an hour
             results.append(result._asdict())
     return lines, {"fit": results}

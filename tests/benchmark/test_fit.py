@@ -98,15 +98,24 @@ def learn_alone(actor: actors.Actor, rate: float, skill: Skill, steps: int, seed
         optimizer.step()
         for kept, new in zip(average.parameters(), network.parameters(), strict=True):
             kept.data.lerp_(new.data, 1 - (1 + step) / (10 + step))
-    return fit.judge(average(skill.later_inputs)[0], skill)
+    with th.no_grad():
+        return fit.explained(average(skill.later_inputs)[0], skill.later_targets)
 
 
 @pytest.mark.parametrize("text", ["lean,reflex", "mlp:8x8"])
 def test_networks_that_learn_side_by_side_learn_what_each_learns_alone(text: str) -> None:
     skill, actor = linear_skill(), parse_actor(text)._replace(rates=(1e-2, 1e-1))
     for rate, reached in fit.learn(actor, skill, (1, 20), seed=3).items():
-        for steps, r2 in reached.items():
-            assert r2 == pytest.approx(learn_alone(actor, rate, skill, steps, 3), abs=1e-4)
+        for steps, fitted in reached.items():
+            assert fitted.later == pytest.approx(learn_alone(actor, rate, skill, steps, 3), abs=1e-4)
+
+
+def test_what_was_learnt_by_heart_shows() -> None:
+    skill = linear_skill()
+    skill = skill._replace(later_targets=th.randn(100, 2, generator=th.Generator().manual_seed(5)))
+    result = fit.best_of(parse_actor("mlp:8x8,rate=1e-2"), skill, (200,), (0,))
+    assert result.r2_learnt[200] > 0.8
+    assert result.r2[200] < 0.2
 
 
 @pytest.mark.parametrize("option", ["relative", "unshunted"])
@@ -182,7 +191,7 @@ def test_equal_circuits_have_as_many_parameters_as_the_paper_s(text: str) -> Non
 
 
 def test_a_network_that_diverges_is_not_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = {1e-2: {5: float("nan")}, 1e-1: {5: 0.2}, 1.0: {5: float("nan")}}
+    found = {rate: {5: fit.Fit(later, 0.3)} for rate, later in ((1e-2, np.nan), (1e-1, 0.2), (1.0, np.nan))}
     monkeypatch.setattr(fit, "learn", lambda *_: found)
     assert fit.best_of(parse_actor("lean")._replace(rates=tuple(found)), linear_skill(), (5,), (0,)).rates == {5: 1e-1}
 
@@ -192,7 +201,8 @@ def test_r2_is_of_the_best_rate() -> None:
     result = fit.best_of(actor, skill, (1, 200), (0, 1))
     assert result.rates[200] == 1e-2
     assert 0.8 < result.r2[200] <= 1.0
-    assert fit.judge(skill.later_targets, skill) == 1.0
+    assert fit.explained(skill.later_targets, skill.later_targets) == 1.0
+    assert fit.explained(th.zeros(100, 2) + skill.later_targets.mean(dim=0), skill.later_targets) == pytest.approx(0.0)
 
 
 def test_the_command_prints_a_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
@@ -200,7 +210,7 @@ def test_the_command_prints_a_table(capsys: pytest.CaptureFixture[str], tmp_path
     assert sb3_tbc.benchmark.command.benchmark([*arguments, "--json", str(tmp_path / "fit.json")]) == 0
     printed = capsys.readouterr().out
     rows = [line for line in printed.splitlines() if line.startswith("|")]
-    assert rows[0] == "| skill | actor | parameters | 1 | 2 |"
+    assert rows[0] == "| skill | actor | parameters | 1 | 2 | learnt from |"
     assert len(rows) == 6
     assert "| delay3 | gru:4 |" in printed
     assert "(0.03)" in printed
