@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.stats import holm
 
-N_SHIFTS, N_RESAMPLES = 5000, 1000
+N_SHIFTS, SHIFTS_PER_TEST, N_RESAMPLES = 5000, 30, 1000
+"""At least so many shifts, and so many for each pair of unit and feature: with fewer than twenty for each pair no
+correlation of a large circuit could be significant after Holm's correction."""
 
 
 class Correlation(NamedTuple):
@@ -41,7 +43,7 @@ class Correlation(NamedTuple):
 
 
 def correlate(
-    activations: Sequence[FloatArray], features: Sequence[FloatArray], seed: int = 0, n_shifts: int = N_SHIFTS
+    activations: Sequence[FloatArray], features: Sequence[FloatArray], seed: int = 0, n_shifts: int | None = None
 ) -> Correlation:
     """Correlate units with features within episodes.
 
@@ -52,7 +54,7 @@ def correlate(
     :param activations: per episode ``(T, N)``
     :param features: per episode ``(T, F)``, of the same lengths
     :param seed: of shifts and resamples
-    :param n_shifts: random shifts
+    :param n_shifts: random shifts; None: 5000, or 30 for each pair of unit and feature if that is more
     :raises ValueError: if there is no episode
     """
     if not activations:
@@ -65,6 +67,8 @@ def correlate(
     power = np.stack([(a**2).sum(axis=0) for a in units]), np.stack([(f**2).sum(axis=0) for f in things])
     r = _ratio(joint.sum(axis=0), power[0].sum(axis=0), power[1].sum(axis=0))
     low, high = _interval(joint, *power, rng)
+    if n_shifts is None:
+        n_shifts = max(N_SHIFTS, SHIFTS_PER_TEST * r.size)
     total = np.zeros((n_shifts, *r.shape))
     for one in shifted:
         total += one[rng.integers(0, len(one), n_shifts)]

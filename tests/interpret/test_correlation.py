@@ -36,6 +36,16 @@ def test_a_planted_unit_is_found_with_its_size() -> None:
     assert found.control_mean < 0.15
 
 
+def test_a_large_circuit_can_have_a_finding() -> None:
+    """The smallest p is one over the number of shifts, times the number of tests after the correction."""
+    rng = np.random.default_rng(3)
+    features = [slow(rng, 60, 1) for _ in range(8)]
+    units = [np.concatenate([slow(rng, 60, 399), f], axis=1) for f in features]  # the last unit is the feature
+    found = correlate(units, features)
+    assert found.p_holm[-1, 0] < 0.05
+    assert (found.p_holm[:-1] < 0.05).mean() < 0.02
+
+
 def test_it_equals_pearson_for_one_episode() -> None:
     rng = np.random.default_rng(1)
     units, features = rng.normal(size=(80, 2)), rng.normal(size=(80, 3))
