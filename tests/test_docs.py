@@ -11,6 +11,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
 from sb3_tbc.commands import COMMANDS
 
@@ -61,7 +62,9 @@ ROWS = {"Pendulum": "hits", "UR5Reacher": "hits", "Drawbridge": "hits", "AntFour
 @pytest.mark.parametrize("task", [*ROWS, "Platforms"])
 def test_readmes_results_are_the_ledgers(task: str) -> None:
     row = next(line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith(f"| {task}"))
+    tuned = yaml.safe_load((ROOT / "results" / "tuning_seeds.yml").read_text())[task]["tbc-hrl"]
     finals = [json.loads(p.read_text()) for p in (ROOT / "results" / task / "tbc-hrl" / "full").glob("*/final.json")]
+    finals = [final for final in finals if final["seed"] not in tuned] or finals
     mean = sum(final["success_rate"] for final in finals) / len(finals)
     said = re.findall(r"(?<![\d.])(1\.00|\.\d\d)", row)[0]
     assert float(said) == round(mean, 2)
