@@ -19,7 +19,12 @@ lowest)  # the bounds of setup.cfg as pins
     options=(--constraint "$pins")
     ;;
 newest)
-    options=(--upgrade)
+    options=(--upgrade --upgrade-strategy eager)
+    if [ -n "${TORCH:-}" ]; then
+        pins=$(mktemp)
+        echo "torch==$TORCH" > "$pins"
+        options+=(--constraint "$pins")
+    fi
     ;;
 *)
     echo "usage: scripts/versions.sh lowest|newest [VENV]" >&2

@@ -10,10 +10,11 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_tbc.aliases import Env, Plain, Wrapper
+from sb3_tbc.smdp.goal_spaces import said_success
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
 from .goal_env_check import check_goal_env, goal_env_problems, name_of
-from .probe import Floats, Probe, run_probe, said_success
+from .probe import Floats, Probe, run_probe
 from .success_test import SuccessTest, compute_reward_of, success_test_of
 from .time_limit import time_limit
 from .tolerances import Tolerances, quaternions, tolerances_of
@@ -183,7 +184,8 @@ def _bounds(
     box = env.observation_space["achieved_goal"]
     assert isinstance(box, spaces.Box)
     least, most = extent
-    margin = np.maximum(0.1 * (most - least), 1e-3)
+    span = most - least
+    margin = np.maximum(0.1 * span, 1e-3 * (span.max() or 1.0))  # of a coordinate that never changes, in any unit
     bounds = (
         np.maximum(least - margin, box.low) if low is None else np.array(low, float),
         np.minimum(most + margin, box.high) if high is None else np.array(high, float),

@@ -15,6 +15,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+UNTEXTURED = "matid" if hasattr(mujoco.MjvGeom, "matid") else "texid"
+"""What says of a shape how it is painted: MuJoCo before 3.2 names a texture, later ones a material; -1 is neither."""
+
 GOAL_RGBA = (0.13, 0.59, 0.33, 0.45)
 
 ASSETS = """
@@ -133,7 +136,7 @@ class Scene:
         mujoco.mjv_addGeoms(self.model, ghost, self._option, self._perturb, dynamic, self.scene)
         for geom in self.scene.geoms[first : self.scene.ngeom]:
             geom.rgba[:] = (0.0, 0.0, 0.0, 0.0) if geom.objid in without else rgba
-            geom.matid = -1
+            setattr(geom, UNTEXTURED, -1)
 
     def add_geom(self, kind: mujoco.mjtGeom, size: ArrayLike, position: ArrayLike, rgba: Sequence[float]) -> None:
         """Add a free-standing shape (a ``mujoco.mjtGeom``) of half-sizes ``size``."""

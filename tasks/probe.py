@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_tbc.aliases import Env, Plain
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+from sb3_tbc.aliases import Env
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, said_success
 from sb3_tbc.smdp.spaces import GoalObservation
 
 Floats = NDArray[np.float64]
@@ -47,6 +47,7 @@ def run_probe(env: Env, n_steps: int, seed: int = 0, episode_steps: int = 50) ->
     :param n_steps: steps together
     :param seed: of the first reset and of the actions
     :param episode_steps: longest episode
+    :raises ValueError: if an observation is not finite
     """
     rng, actions = np.random.default_rng(seed), env.action_space
     assert isinstance(actions, spaces.Box)
@@ -67,13 +68,10 @@ def run_probe(env: Env, n_steps: int, seed: int = 0, episode_steps: int = 50) ->
             successes.append(said_success(info))
             ended = terminated or truncated
     stacked = {key: np.stack([observation[key] for observation in seen]) for key in GOAL_KEYS}
+    for key, part in stacked.items():
+        if not np.isfinite(part).all():
+            raise ValueError(f"observation[{key!r}] of {type(env.unwrapped).__name__} is not finite in random episodes")
     return Probe(stacked, np.array(after), np.array(rewards), np.array(terminations), successes)
-
-
-def said_success(info: Plain) -> bool | None:
-    """Success of a step by the entry ``is_success`` or ``success`` of its ``info``; None if there is neither."""
-    said = info.get("is_success", info.get("success"))
-    return None if said is None else bool(np.all(said))
 
 
 def _copied(observation: GoalObservation) -> dict[str, Floats]:

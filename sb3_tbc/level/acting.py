@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
+import torch as th
 from numpy.typing import NDArray
 from torch import nn
 
@@ -83,14 +84,21 @@ class FrozenMLP:
 
 def _as_array(block: Block) -> FloatArray:
     """A block of at most two dimensions as one array, without a copy if its parameters lie in flat storage."""
-    first = block.parameters[0].detach()
+    flat = _in_one_piece(block.parameters)
+    if flat is None:  # a copied policy, not yet in flat storage
+        return np.concatenate([p.detach().numpy() for p in block.parameters])
+    return flat.reshape(block.shape)
+
+
+def _in_one_piece(parameters: Sequence[th.Tensor]) -> FloatArray | None:
+    """Parameters that lie one after another as one array ``(n,)`` that shares their memory; None if they do not."""
+    first = parameters[0].detach()
     end = first.data_ptr()
-    for parameter in block.parameters:
-        if parameter.data_ptr() != end:  # a copied policy, not yet in flat storage
-            return np.concatenate([p.detach().numpy() for p in block.parameters])
+    for parameter in parameters:
+        if parameter.data_ptr() != end:
+            return None
         end += parameter.numel() * parameter.element_size()
-    strides = (block.shape[1], 1) if len(block.shape) == 2 else (1,)
-    return first.as_strided(block.shape, strides).numpy()
+    return first.as_strided(((end - first.data_ptr()) // first.element_size(),), (1,)).numpy()
 
 
 def freeze(actor: MLPActor | NDBCActor, dtype: FloatType = np.float32) -> FrozenNet:
@@ -103,6 +111,31 @@ def freeze(actor: MLPActor | NDBCActor, dtype: FloatType = np.float32) -> Frozen
 
         return FrozenNDBC(actor.net)
     return FrozenMLP(actor, dtype)
+
+
+class Weights:
+    """Notices that an actor's parameters were changed by hand: in place, or by other tensors in their place.
+
+    :param actor: the actor
+    """
+
+    def __init__(self, actor: nn.Module) -> None:
+        self._parameters = list(actor.parameters())
+        self.note()
+
+    def note(self) -> None:
+        """Remember the parameters as they are."""
+        self._places = [p.data_ptr() for p in self._parameters]
+        flat = _in_one_piece(self._parameters)
+        self._arrays = [p.detach().numpy().ravel() for p in self._parameters] if flat is None else [flat]
+        self._squares = self._sum()
+
+    def changed(self) -> bool:
+        """Whether they are others now."""
+        return [p.data_ptr() for p in self._parameters] != self._places or self._sum() != self._squares
+
+    def _sum(self) -> list[float]:
+        return [float(np.dot(array, array)) for array in self._arrays]  # a microsecond for some thousand weights
 
 
 class FrozenActor:
@@ -121,6 +154,7 @@ class FrozenActor:
         self._version = policy.weights_version
         self._dtype = np.float64 if average else np.float32
         self._net = freeze(actor, self._dtype)
+        self._weights = Weights(actor)
         head: GaussianHead = actor.head
         self._dim = int(np.prod(actor.action_space.shape))
         mean_bound = np.inf if head.mean_bound is None else head.mean_bound
@@ -163,5 +197,10 @@ class FrozenActor:
     def _current(self) -> FrozenNet:
         if self._version != self._policy.weights_version:
             self._net.refresh()
+            self._weights.note()
             self._version = self._policy.weights_version
         return self._net
+
+    def is_stale(self) -> bool:
+        """Whether the weights were changed by hand since they were read."""
+        return self._version == self._policy.weights_version and self._weights.changed()

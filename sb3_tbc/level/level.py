@@ -247,6 +247,11 @@ class SACLevel(SAC):
         """Make the next :meth:`act` read the weights again; needed after changing them by hand."""
         self.policy.after_updates(0)
 
+    def notice_changes(self) -> None:
+        """Read the weights again if they were changed by hand since they were read."""
+        if any(frozen.is_stale() for frozen in self._frozen.values()):
+            self.refresh()
+
     def act(
         self,
         observations: FloatArray,

@@ -16,12 +16,12 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
 from sb3_tbc.aliases import Env, Plain, Space, Wrapper
 from sb3_tbc.arrays import Arrays, BoolArray, FloatArray
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.faults import fault
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, goal_space_problems
@@ -36,32 +36,35 @@ BUDGET_EXHAUSTED = "budget_exhausted"
 BAD_STEP = "bad_step"
 """Key of ``info``: what is wrong with what this step, or this reset, gave; the observation is not to be used then."""
 
+RESETS = "sb3_tbc.resets"
+"""Key of ``info``: how often the task was reset so far, which tells whether someone else has begun an episode in it."""
+
 
 class LastWindow(NamedTuple):
     """The last window that an episode may have.
 
-    :param steps: environment steps until its time budget is spent
+    Steps are the agent's own, which a wrapper may make of several of the task's (frames that are skipped). So the agent
+    itself counts them, and announces the very last one.
+
+    :param ends_now: whether the window ends with the next step
     :param subgoals: to see whether it ends earlier; None: it runs to the end of its budget
     :param subgoal: what was asked for; None where reaching it does not end the window
-    :param not_before: number of the first step, counted from 1, at which reaching the subgoal may end it
     """
 
-    steps: int
+    ends_now: bool
     subgoals: SubgoalSpace | None = None
     subgoal: FloatArray | None = None
-    not_before: int = 1
 
-    def over(self, passed: int, seen: GoalObservation) -> bool:
+    def over(self, seen: GoalObservation) -> bool:
         """Whether the window is over.
 
-        :param passed: number of its steps so far
-        :param seen: what the last of them led to
+        :param seen: what its last step led to
         """
-        if passed >= self.steps or self.subgoals is None:
-            return passed >= self.steps
+        if self.ends_now or self.subgoals is None:
+            return self.ends_now
         if bool(self.subgoals.happened(seen)):
             return True
-        if self.subgoal is None or passed < self.not_before:
+        if self.subgoal is None:
             return False
         return bool(self.subgoals.reached(self.subgoals.achieved(seen), self.subgoal))
 
@@ -81,21 +84,24 @@ class EpisodeLimit(Wrapper, RecordConstructorArgs):
         self._parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {}
         self._shapes = shapes_of(space)
         self._last: LastWindow | None = None
-        self._passed = self._steps = 0
+        self._steps = self._resets = 0
 
     def announce_last_window(self, window: LastWindow) -> None:
         """End the episode with this window."""
-        self._last, self._passed = window, 0
+        self._last = window
 
     def reset(self, **kwargs: Any) -> tuple[object, Plain]:
         """Begin an episode, and forget what was announced."""
         self._last, self._steps = None, 0
+        self._resets += 1
         try:
             observation, info = self.env.reset(**kwargs)
         except Exception as error:  # a task's own code may fail in any way
             raise fault(self.index, self._steps, error) from error
         wrong = self._wrong(observation, info)
-        return (observation, info) if wrong is None else (self._blank(), {BAD_STEP: wrong})
+        if wrong is not None:
+            return self._blank(), {BAD_STEP: wrong, RESETS: self._resets}
+        return observation, {**info, RESETS: self._resets}
 
     def step(self, action: object) -> tuple[object, SupportsFloat, bool, bool, Plain]:
         """Step; the last observation of an episode is copied, as some environments reuse their arrays.
@@ -112,12 +118,12 @@ class EpisodeLimit(Wrapper, RecordConstructorArgs):
             raise fault(self.index, self._steps, error) from error
         wrong = self._wrong(observation, info, reward)
         if wrong is not None:
-            return self._blank(), 0.0, False, False, {BAD_STEP: wrong}
+            return self._blank(), 0.0, False, False, {BAD_STEP: wrong, RESETS: self._resets}
+        info = {**info, RESETS: self._resets}
         if self._last is not None and not (terminated or truncated):
-            self._passed += 1
-            truncated = self._last.over(self._passed, self._as_declared(observation))
+            truncated = self._last.over(self._as_declared(observation))
             if truncated:
-                info = {**info, BUDGET_EXHAUSTED: True}
+                info[BUDGET_EXHAUSTED] = True
         if (terminated or truncated) and isinstance(observation, dict):
             observation = {key: np.array(part) for key, part in observation.items()}
         return observation, reward, terminated, truncated, info
@@ -193,15 +199,15 @@ class CopyableVecEnvWrapper(VecEnvWrapper):
 class LimitingVecEnv(CopyableVecEnvWrapper):
     """As :class:`EpisodeLimit`, for environments that cannot be wrapped one by one, e.g. those in other processes.
 
-    Whatever is wrapped around this vector sees the end of the episode; a ``Monitor`` in another process does not.
+    Whatever is wrapped around this vector sees the end of the episode.
     """
 
     def __init__(self, venv: VecEnv) -> None:
         super().__init__(venv)
         self._last: dict[int, LastWindow] = {}
-        self._passed = np.zeros(venv.num_envs, dtype=np.int64)
         self._returns = np.zeros(venv.num_envs)
         self._lengths = np.zeros(venv.num_envs, dtype=np.int64)
+        self._resets = np.zeros(venv.num_envs, dtype=np.int64)
         self._began = time.time()
         self._shapes = shapes_of(venv.observation_space)
 
@@ -213,22 +219,22 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: object
     ) -> list[object]:
         """Call a method of the environments; announcements end here."""
-        if method_name == "reset":
-            for index in self._get_indices(indices):
-                self._forget(index)
         if method_name != ANNOUNCE:
-            return super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
+            answers = super().env_method(method_name, *method_args, indices=indices, **method_kwargs)
+            for index in self._get_indices(indices) if method_name == "reset" else ():
+                self._begin(index)
+            return answers
         for index in self._get_indices(indices):
-            self._last[index], self._passed[index] = method_args[0], 0
+            self._last[index] = method_args[0]
         return []
 
     def reset(self) -> VecEnvObs:
         """Begin an episode everywhere."""
-        self._last.clear()
-        self._returns[:], self._lengths[:] = 0.0, 0
-        if not isinstance(self.venv, SubprocVecEnv):
-            return self.venv.reset()
-        return reset_checked(self.venv, self._shapes)
+        there = isinstance(self.venv, SubprocVecEnv)
+        observation = reset_checked(self.venv, self._shapes) if there else self.venv.reset()  # type: ignore[arg-type]
+        for index in range(self.num_envs):
+            self._begin(index)
+        return observation
 
     def step_wait(self) -> VecEnvStepReturn:
         """Step; end the episodes whose last window is over."""
@@ -238,26 +244,38 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         )
         self._returns += rewards
         self._lengths += 1
+        for index, info in enumerate(infos):
+            info[RESETS] = int(self._resets[index])
         for index, window in list(self._last.items()):
-            self._passed[index] += 1
             seen: GoalObservation = {}
             if isinstance(observation, dict):
                 seen = {key: observation[key][index] for key in GOAL_KEYS if key in observation}
-            if not dones[index] and window.over(int(self._passed[index]), seen):
+            if not dones[index] and window.over(seen):
                 self._end(index, observation, dones, infos[index])  # type: ignore[arg-type]
         for ended in np.flatnonzero(dones):
-            self._forget(int(ended))
+            self._begin(int(ended))
         return observation, rewards, dones, infos
 
-    def _forget(self, index: int) -> None:
+    def _begin(self, index: int) -> None:
+        """An episode has begun: forget what was announced, and count it where the agent looks."""
         self._last.pop(index, None)
         self._returns[index], self._lengths[index] = 0.0, 0
+        self._resets[index] += 1
+        told = self.venv.reset_infos
+        told[index] = {**(told[index] or {}), RESETS: int(self._resets[index])}
 
     def _end(self, index: int, observation: Arrays, dones: BoolArray, info: Plain) -> None:
         episode = {"r": float(self._returns[index]), "l": int(self._lengths[index]), "t": time.time() - self._began}
         info |= {BUDGET_EXHAUSTED: True, "TimeLimit.truncated": True, "episode": episode}
         info["terminal_observation"] = {key: np.array(part[index]) for key, part in observation.items()}
-        fresh, self.reset_infos[index] = self.venv.env_method("reset", indices=[index])[0]
+        try:
+            fresh, self.venv.reset_infos[index] = self.venv.env_method("reset", indices=[index])[0]
+        except NotImplementedError as error:
+            raise ConfigError(
+                f"{type(self.venv).__name__} cannot reset one environment alone, which ends an episode whose decisions "
+                "are used up: implement env_method('reset', indices=[i]), or set max_options and dt_max so that "
+                "windows outlast episodes"
+            ) from error
         for key, part in observation.items():
             part[index] = fresh[key]
         dones[index] = True
@@ -309,23 +327,29 @@ def _stacked(observations: list[Plain], workers: SubprocVecEnv) -> VecEnvObs:
     return {key: np.stack([seen[key] for seen in observations]) for key in space.spaces}
 
 
-class MonitorOfLimit(Monitor):
-    """The class that a ``Monitor`` in another process has for a moment, so that it puts the limit beneath itself."""
+class PutLimit:
+    """Puts the limit around a task in another process, beneath all its wrappers.
 
-    def put_limit(self, index: int) -> None:
-        """Put the limit around the task itself.
+    ``VecEnv.env_is_wrapped`` takes an object of ours there: the process asks whether its outermost wrapper is an
+    instance of the class that it is sent. This one is sent in the place of a class, and puts the limit in when asked.
 
-        :param index: the environment's number in the vector
-        """
-        self.__class__ = Monitor  # type: ignore[assignment]
-        _put_limit(self, index)
+    :param index: the environment's number in the vector
+    """
+
+    def __init__(self, index: int) -> None:
+        self.index = index
+
+    def __instancecheck__(self, env: Env) -> bool:
+        """Put it in, and say yes, so that no wrapper beneath is asked."""
+        _put_limit(env, self.index)
+        return True
 
 
 def with_episode_limit(venv: VecEnv) -> VecEnv:
     """Make the environments of a vector able to end an episode for the agent, and return the vector to use.
 
-    The limit goes around each task itself where it can be reached: in this process, and beneath a ``Monitor`` that is
-    outermost in another one. Elsewhere it goes around the innermost vector.
+    The limit goes around each task itself where it can be reached: in this process, and beneath its wrappers in another
+    one. Elsewhere it goes around the innermost vector.
     """
     if venv.has_attr(ANNOUNCE):
         return venv
@@ -336,10 +360,9 @@ def with_episode_limit(venv: VecEnv) -> VecEnv:
         base = base.venv
     if isinstance(base, DummyVecEnv):
         base.envs = [_put_limit(env, index) for index, env in enumerate(base.envs)]
-    elif base.has_attr("class_name") and set(base.env_method("class_name")) == {"Monitor"}:
-        base.set_attr("__class__", MonitorOfLimit)
+    elif isinstance(base, SubprocVecEnv) and base.has_attr("class_name"):  # there are wrappers
         for index in range(base.num_envs):
-            base.env_method("put_limit", index, indices=[index])
+            base.env_is_wrapped(PutLimit(index), indices=[index])  # type: ignore[arg-type]
     elif around is None:
         return LimitingVecEnv(base)
     else:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from gymnasium import spaces
 
-from sb3_tbc.aliases import Space
+from sb3_tbc.aliases import PlainMapping, Space
 from sb3_tbc.arrays import AnyArray
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
@@ -60,6 +60,17 @@ def check_goal_space(observation: Space, action: Space | None = None) -> spaces.
 def width(space: spaces.Dict, key: str) -> int:
     """Number of entries of a part of a goal observation."""
     return int(np.prod(space.spaces[key].shape or ()))
+
+
+def said_success(info: PlainMapping) -> bool | None:
+    """Success by the entry ``is_success`` or ``success`` of an ``info``; None if there is neither, or it says nothing.
+
+    :param info: of a step
+    """
+    said = np.asarray(info.get("is_success", info.get("success")))
+    if said.dtype.kind not in "biuf" or not said.size or not np.isfinite(said).all():
+        return None  # None, a text, NaN
+    return bool(said.all())
 
 
 class UnitActions:

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
 from sb3_tbc.errors import ConfigError, NonFiniteError
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, said_success
 from sb3_tbc.smdp.hindsight import GoalTest
 
 TRIED = 3
@@ -74,10 +74,16 @@ def check_goal_test(venv: VecEnv, infos: list[Plain] | None = None) -> None:
     achieved, desired = (np.stack([space.sample() for _ in range(TRIED)]).astype(np.float64) for _ in range(2))
     try:
         test = goal_test_of(venv)
+        given = achieved.copy(), desired.copy()
         test.reward(achieved, desired)
         test.terminated(achieved, desired)
         if infos is not None:
             venv.env_method("compute_reward", achieved, desired, infos, indices=[0])
+        if not (np.array_equal(given[0], achieved) and np.array_equal(given[1], desired)):
+            raise ConfigError(
+                "compute_reward or compute_terminated changes the goals that it is given (as 'achieved_goal -= ...' "
+                "does), which are what is learnt from: let it work on new arrays, achieved_goal - desired_goal"
+            )
     except (ConfigError, NonFiniteError):
         raise
     except Exception as error:  # a task's own code may fail in any way
@@ -113,9 +119,9 @@ class EpisodeJudge:
 
         :param info: of the step that ended the episode
         """
-        said = info.get("is_success", info.get("success"))
+        said = said_success(info)
         if said is not None:
-            return bool(said)
+            return said
         if self._venv.has_attr("compute_reward"):
             last = info["terminal_observation"]
             achieved, desired = (np.asarray(last[key], dtype=np.float64)[None] for key in GOAL_KEYS[1:])

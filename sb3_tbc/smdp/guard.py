@@ -12,10 +12,11 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
 from sb3_tbc.errors import EnvironmentFault, NonFiniteError
-from sb3_tbc.smdp.episode_limit import BAD_STEP, CopyableVecEnvWrapper
+from sb3_tbc.smdp.episode_limit import BAD_STEP, RESETS, CopyableVecEnvWrapper
 from sb3_tbc.smdp.faults import reset_or_name, step_or_name
 from sb3_tbc.smdp.finite import all_finite, not_finite, place
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+from sb3_tbc.smdp.goal_test import EpisodeJudge
 from sb3_tbc.smdp.spaces import GoalObservation
 
 OnBadStep = Literal["stop", "end-episode"]
@@ -23,6 +24,10 @@ MOST_IN_A_ROW = 10
 """Episodes of an environment that may be over with their first step before its bad steps end the run after all."""
 TOLD = 10
 """Bad steps that are told of one by one; the later ones are only counted."""
+USED_ELSEWHERE = (
+    "it was reset by someone else while the agent's episode was running (as evaluate_policy(model, model.get_env()) "
+    "does); evaluate in an environment of its own"
+)
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +56,7 @@ class Guard:
         self._none_bad = np.zeros(venv.num_envs, dtype=bool)
         self._in_a_row = np.zeros(venv.num_envs, dtype=np.int64)
         self._last: GoalObservation = {}
+        self._resets: list[int | None] = [None] * venv.num_envs  # of each task, at the begin of its running episode
 
     def reset(self) -> GoalObservation:
         """Reset every environment.
@@ -67,15 +73,19 @@ class Guard:
 
         :raises NonFiniteError: naming environment and key
         """
-        self._refuse_resets(observation, np.ones(self.venv.num_envs, dtype=bool))
+        everywhere = np.ones(self.venv.num_envs, dtype=bool)
+        self._refuse_resets(observation, everywhere)
         self._last = observation
+        self._note_resets(everywhere)
 
-    def go_on(self, observation: GoalObservation) -> None:
+    def go_on(self, observation: GoalObservation, before: Guard | None = None) -> None:
         """Go on with episodes that run already.
 
         :param observation: what the environments show
+        :param before: what guarded these episodes so far; None: their beginning is not known
         """
         self._last = observation
+        self._resets = [None] * self.venv.num_envs if before is None else before._resets
 
     def step(self, actions: AnyArray, steps: AnyArray) -> GuardedStep:
         """Step every environment.
@@ -91,14 +101,28 @@ class Guard:
         observation, rewards, dones, given = step_or_name(self.venv, actions, steps)
         infos: list[Plain] = list(given)
         seen = before_reset(observation, dones, infos)  # type: ignore[arg-type]
-        well = all_finite(*[seen[key] for key in GOAL_KEYS], rewards) and not _any_bad(infos)
+        well = all_finite(*[seen[key] for key in GOAL_KEYS], rewards) and not self._any_bad(infos)
         if not well and seen is observation:  # what was seen and what the reset shows are to differ from here on
             seen = {key: np.array(part) for key, part in seen.items()}
         bad = self._none_bad if well else self._end_bad(observation, rewards, dones, infos, seen, steps)  # type: ignore[arg-type]
         if np.count_nonzero(dones):
             self._refuse_resets(observation, dones)  # type: ignore[arg-type]
+            self._note_resets(dones)
         self._last = observation  # type: ignore[assignment]
         return GuardedStep(observation, rewards, dones, infos, seen, bad)  # type: ignore[arg-type]
+
+    def _any_bad(self, infos: list[Plain]) -> bool:
+        """Whether an environment's limit found something wrong with its step, or it is not in the agent's episode."""
+        for info, expected in zip(infos, self._resets, strict=True):  # a generator costs more
+            if BAD_STEP in info or (expected is not None and info.get(RESETS, expected) != expected):
+                return True
+        return False
+
+    def _note_resets(self, where: BoolArray) -> None:
+        """Remember which episodes have begun, so that those that someone else begins are told from them."""
+        told = getattr(self.venv.unwrapped, "reset_infos", ())
+        for index in np.flatnonzero(where):
+            self._resets[index] = (told[index] or {}).get(RESETS) if len(told) > index else None
 
     def _refuse_resets(self, observation: GoalObservation, where: BoolArray) -> None:
         """Nothing can be done about an episode that begins badly."""
@@ -116,12 +140,13 @@ class Guard:
         bad = self._none_bad.copy()
         for index in range(self.venv.num_envs):
             step, told = int(steps[index]) + 1, infos[index].get(BAD_STEP)
-            what = told or not_finite(index, seen, rewards)
+            expected = self._resets[index]
+            elsewhere = expected is not None and infos[index].get(RESETS, expected) != expected
+            what = USED_ELSEWHERE if elsewhere else told or not_finite(index, seen, rewards)
             if what is None:
                 continue
-            self._in_a_row[index] = self._in_a_row[index] + 1 if step == 1 else 0
-            if self.on_bad_step == "stop" or self._in_a_row[index] > MOST_IN_A_ROW:
-                _raise(index, step, told, seen, rewards, "The step was not stored: look into the environment")
+            if not elsewhere:
+                self._stop_or_count(index, step, told, seen, rewards)
             self._tell(f"{place(index, step)}: {what}")
             bad[index] = True
             rewards[index] = 0.0
@@ -131,12 +156,23 @@ class Guard:
             if not dones[index]:
                 fresh, info = self.venv.env_method("reset", indices=[index])[0]
                 _refuse_reset(index, fresh, info, observation)
+                if RESETS in info:
+                    told_at_reset = list(self.venv.unwrapped.reset_infos)
+                    told_at_reset[index] = info
+                    self.venv.unwrapped.reset_infos = told_at_reset
                 for key, part in observation.items():
                     part[index] = fresh[key]
                 dones[index] = True
             infos[index] = {"terminal_observation": last, "TimeLimit.truncated": True, "is_success": False,
                             BAD_STEP: what}  # fmt: skip
         return bad
+
+    def _stop_or_count(
+        self, index: int, step: int, told: str | None, seen: GoalObservation, rewards: FloatArray
+    ) -> None:
+        self._in_a_row[index] = self._in_a_row[index] + 1 if step == 1 else 0
+        if self.on_bad_step == "stop" or self._in_a_row[index] > MOST_IN_A_ROW:
+            _raise(index, step, told, seen, rewards, "The step was not stored: look into the environment")
 
     def _tell(self, what: str) -> None:
         self.count += 1
@@ -168,18 +204,10 @@ def _raise(
         raise NonFiniteError(f"{place(index, step)}: {what}. {then}")
 
 
-def _any_bad(infos: list[Plain]) -> bool:
-    """Whether an environment's limit found something wrong with its step."""
-    for info in infos:  # noqa: SIM110 - a generator costs more than the few environments
-        if BAD_STEP in info:
-            return True
-    return False
-
-
 def before_reset(observation: GoalObservation, dones: BoolArray, infos: list[Plain]) -> GoalObservation:
     """What a step led to: SB3 hides the last observation of an episode in ``info``."""
     ended = np.flatnonzero(dones) if np.count_nonzero(dones) else ()
-    if not len(ended) and not _any_bad(infos):
+    if not len(ended):
         return observation
     seen = {key: np.array(observation[key]) for key in observation}
     for index in ended:
@@ -194,7 +222,6 @@ class GuardedVecEnv(CopyableVecEnvWrapper):
     :param venv: see :class:`Guard`
     :param on_bad_step: likewise
     :param steps: of the running episodes so far, ``(n_envs,)``
-    :param observation: what the environments show; None before they are reset
     """
 
     def __init__(
@@ -202,14 +229,12 @@ class GuardedVecEnv(CopyableVecEnvWrapper):
         venv: VecEnv,
         on_bad_step: OnBadStep = "stop",
         steps: AnyArray | None = None,
-        observation: GoalObservation | None = None,
     ) -> None:
         super().__init__(venv)
         self.guard = Guard(venv, on_bad_step)
         self.steps = np.zeros(venv.num_envs, dtype=np.int64) if steps is None else steps.copy()
+        self.judge = EpisodeJudge(venv)
         self._actions: AnyArray = np.zeros(0)
-        if observation is not None:
-            self.guard.go_on(observation)
 
     def reset(self) -> VecEnvObs:
         """Reset every environment, see :meth:`Guard.reset`."""
@@ -221,8 +246,10 @@ class GuardedVecEnv(CopyableVecEnvWrapper):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Step, see :meth:`Guard.step`."""
+        """Step, see :meth:`Guard.step`; ``info["is_success"]`` says of each episode that ends whether it succeeded."""
         step = self.guard.step(self._actions, self.steps)
         self.steps += 1
         self.steps[step.dones] = 0
+        for index in np.flatnonzero(step.dones):
+            step.infos[index]["is_success"] = self.judge.succeeded(step.infos[index])
         return step.observation, step.rewards, step.dones, step.infos  # type: ignore[return-value]

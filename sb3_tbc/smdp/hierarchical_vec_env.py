@@ -109,6 +109,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self.judge = EpisodeJudge(venv)
         self.guard = Guard(venv, on_bad_step)
         self._started = False
+        self._last_step: dict[int, int] = {}  # of a window that is its episode's last, by environment
+        self._may_end: set[int] = set()  # environments that know the subgoal of that window
         self._given: AnyArray = np.zeros(0)  # what step_async was given
 
     def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
@@ -193,6 +195,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
     ) -> HierarchicalStep:
         if not self._started:
             raise HierarchyError("HierarchicalVecEnv.step was called before reset")
+        self._announce_ends()
         no_memory = self._no_memory
         self._recorder.before_step(
             unit, no_memory if states is None else states, no_memory if next_states is None else next_states
@@ -227,7 +230,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         late = over & ~dones & (self.clock.used >= self.rules.max_options)
         if np.count_nonzero(late):
             for index in np.flatnonzero(late):
-                self.venv.env_method(ANNOUNCE, LastWindow(1), indices=[int(index)])
+                self._last_step[int(index)] = 0
             over &= ~late
         return over
 
@@ -277,18 +280,30 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self._announce(where)
 
     def _announce(self, where: Indices) -> None:
-        """Tell the environments which windows are the last of their episodes."""
-        for index in where[self.clock.used[where] >= self.rules.max_options]:
-            self.venv.env_method(ANNOUNCE, self._last_window(index), indices=[int(index)])
+        """Take note of the windows that are the last of their episodes."""
+        for index in map(int, where):
+            self._last_step.pop(index, None)
+            self._may_end.discard(index)
+            if self.clock.used[index] >= self.rules.max_options:
+                self._last_step[index] = max(1, math.ceil(self.clock.time_budget[index]))
+                if self._task_can_tell and self.views.subgoals.event is not None:
+                    self.venv.env_method(ANNOUNCE, LastWindow(False, self.views.subgoals), indices=[index])
 
-    def _last_window(self, index: int) -> LastWindow:
-        """The live option of an environment, described so that the task can end the episode with it."""
-        elapsed = self.clock.elapsed[index]
-        steps = max(1, math.ceil(self.clock.time_budget[index] - elapsed))
-        if not self._task_can_tell:
-            return LastWindow(steps)
-        subgoal = self.clock.subgoal[index].copy() if self.rules.ends_when_reached else None
-        return LastWindow(steps, self.views.subgoals, subgoal, math.ceil(self.rules.dt_min) - int(elapsed))
+    def _announce_ends(self) -> None:
+        """Tell the environments whose last window is, or may be, over with the next step, to end the episode then."""
+        for index, last in self._last_step.items():
+            step = self.clock.elapsed[index] + 1
+            if step >= last:
+                self.venv.env_method(ANNOUNCE, LastWindow(True), indices=[index])
+            elif step >= self.rules.dt_min and index not in self._may_end and self._ends_early:
+                self._may_end.add(index)
+                window = LastWindow(False, self.views.subgoals, self.clock.subgoal[index].copy())
+                self.venv.env_method(ANNOUNCE, window, indices=[index])
+
+    @property
+    def _ends_early(self) -> bool:
+        """Whether the environment is to end an episode where its last window reaches the subgoal."""
+        return self._task_can_tell and self.rules.ends_when_reached
 
     def _low_observation(self, observation: GoalObservation) -> FloatArray:
         remaining = self.rules.remaining(self.clock.time_left)

@@ -26,6 +26,11 @@ class TwoLevelActor:
     ) -> None:
         self.high, self.low, self.memory, self.reconsideration = high, low, memory, reconsideration
 
+    def notice_changes(self) -> None:
+        """Act from weights that were changed by hand, too."""
+        self.high.notice_changes()
+        self.low.notice_changes()
+
     def blank(self, n_envs: int) -> FloatArray:
         """The low level's memory before anything happened, ``(n_envs, state_dim)``."""
         return np.zeros((n_envs, self.low.state_dim), dtype=np.float32)

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+
+from sb3_tbc.settings import hints
+from sb3_tbc.tbc_hrl.config import TBCConfig
+from sb3_tbc.tbc_hrl.former_settings import OF_SB3_ALONE
 
 
 def whole_steps(total_timesteps: Any) -> int:
@@ -42,7 +47,8 @@ def refuse_vec_normalize(env: VecEnv) -> None:
     """
     if unwrap_vec_normalize(env) is not None:
         raise ValueError(
-            "VecNormalize moves the subgoal space while the agent learns; use the task's fixed scales instead"
+            "VecNormalize moves the subgoal space, and the units of goals, while the agent learns; use the task's "
+            "fixed scales instead"
         )
 
 
@@ -60,6 +66,46 @@ def explain_level_setting(name: str) -> None:
             f"{name} belongs to a level, and there are two: read model.low_settings[{name!r}] and "
             f"model.high_settings[{name!r}]"
         )
+
+
+CHANGEABLE_LATER = ("gradient_ratio", "learning_starts")
+"""Settings of the agent that may be set at any time: they are read at each burst of updates."""
+OF_THE_AGENT = frozenset((*hints(TBCConfig), *OF_SB3_ALONE)) - {"high", "low", "use_sde", "sde_sample_freq"}
+"""What belongs to the agent as a whole, here or in SB3; SB3 itself sets the two that are left out."""
+
+
+def refuse_fixed(name: str, value: object) -> None:
+    """Refuse to set what is fixed when an agent is made, or what there is not here.
+
+    :raises AttributeError: naming what to do instead
+    """
+    if name in OF_SB3_ALONE:
+        raise AttributeError(f"{name} is nothing that can be set: {OF_SB3_ALONE[name]}")
+    if name not in CHANGEABLE_LATER:
+        raise AttributeError(
+            f"{name} is fixed when the agent is made or loaded: save it, and load(path, env, {name}={value!r})"
+        )
+
+
+def refuse_policy(policy: object, known: Iterable[str]) -> None:
+    """Refuse a policy of Stable-Baselines3 that there is not here.
+
+    :param policy: its class, which SB3 checks, or its name
+    :param known: the names there are
+    :raises ValueError: if the name is another one
+    """
+    if isinstance(policy, str) and policy not in known:
+        allowed = " or ".join(map(repr, known))
+        raise ValueError(f"policy must be {allowed}, got {policy!r}: goal observations are dictionaries of vectors")
+
+
+def refuse_no_environment(env: object) -> None:
+    """Refuse to build an agent for no environment.
+
+    :raises ValueError: if there is none
+    """
+    if env is None:
+        raise ValueError("an agent is built for an environment, got env=None; TBCHRL.load needs none to act")
 
 
 def refuse_level_setting(name: str, value: object) -> None:

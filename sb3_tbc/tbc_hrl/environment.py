@@ -7,21 +7,60 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.arrays import Arrays
+from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.bounds import RewardRange
+from sb3_tbc.smdp.episode_limit import with_episode_limit
+from sb3_tbc.smdp.faults import watch
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, width
+from sb3_tbc.smdp.goal_test import check_goal_test
+from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.tasks.layouts import layout_cure
 from sb3_tbc.tasks.time_limit import declared_limit, time_limit
+from sb3_tbc.tbc_hrl.calls import refuse_vec_normalize
 
 
 def attribute_of(env: VecEnv, name: str) -> Any:
     """Attribute of the first task under its wrappers; None where there is none."""
     # Asking for what is not there would end the process of an environment that has one of its own.
     return env.get_attr(name, indices=[0])[0] if env.has_attr(name) else None
+
+
+def in_vector(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+    """A vector of environments whose episodes an agent can end; single ones in one that can be resumed.
+
+    :param verbose: see SB3
+    :param monitor_wrapper: likewise
+    :raises TypeError: if it is neither an environment nor a vector
+    """
+    if not isinstance(env, gym.Env | VecEnv):
+        raise TypeError(
+            f"env must be an environment, the id of one, or a vector of them (VecEnv), got {one_line(repr(env), 100)}"
+        )
+    given = in_goal_vec_env(env) if monitor_wrapper else env
+    venv = BaseAlgorithm._wrap_env(given, verbose, monitor_wrapper)
+    watch(venv)
+    return with_episode_limit(venv)
+
+
+def in_fitting_vector(env: GymEnv, agent: BaseAlgorithm) -> VecEnv:
+    """As :func:`in_vector`, of an environment in which an agent is to go on learning.
+
+    :raises ValueError: if its spaces are others, it normalises observations, or goals cannot be relabelled in it
+    """
+    venv = in_vector(env, agent.verbose)
+    refuse_vec_normalize(venv)
+    check_for_correct_spaces(venv, agent.observation_space, agent.action_space)
+    check_goal_test(venv)
+    return venv
 
 
 def reward_range(env: VecEnv) -> RewardRange | None:

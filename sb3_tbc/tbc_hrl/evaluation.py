@@ -11,7 +11,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_tbc.aliases import Env
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.episode_limit import with_episode_limit
-from sb3_tbc.smdp.goal_test import EpisodeJudge
 from sb3_tbc.smdp.guard import GuardedVecEnv
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
@@ -71,7 +70,6 @@ def evaluate_flat(
 ) -> EvaluationResult:
     """As :func:`evaluate_hierarchical`, for an agent without subgoals: these figures are NaN, decisions are 0."""
     venv: VecEnv = GuardedVecEnv(with_episode_limit(_vector(env, n_eval_episodes)), model.on_bad_step)
-    judge = EpisodeJudge(venv)
     if seed is not None:
         venv.seed(seed)
     observation = venv.reset()
@@ -83,7 +81,7 @@ def evaluate_flat(
         observation, rewards, dones, infos = venv.step(actions)
         totals += np.stack([np.ones(venv.num_envs), rewards])
         for index in np.flatnonzero(dones):
-            results[index].append((judge.succeeded(infos[index]), *totals[:, index], np.nan, np.nan, 0, False))
+            results[index].append((infos[index]["is_success"], *totals[:, index], np.nan, np.nan, 0, False))
             totals[:, index] = 0.0
     return _columns([rows[i] for i in range(per_env) for rows in results], n_eval_episodes)
 

@@ -11,7 +11,6 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
-from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import MultiInputPolicy
 
 from sb3_tbc.aliases import Plain
@@ -23,18 +22,17 @@ from sb3_tbc.settings import hints, read_partial
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_spaces import check_goal_space
 from sb3_tbc.smdp.goal_test import TRIED, check_goal_test
-from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.smdp.guard import GuardedVecEnv, OnBadStep
 from sb3_tbc.smdp.hindsight import check_goal_strategy
 from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSettings, takes
 from sb3_tbc.tbc_hrl.averaged_policy import AveragedPolicy
-from sb3_tbc.tbc_hrl.calls import whole_steps
+from sb3_tbc.tbc_hrl.calls import refuse_policy, refuse_vec_normalize, whole_steps
 from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.diagnostics import record_settings
-from sb3_tbc.tbc_hrl.environment import attribute_of
+from sb3_tbc.tbc_hrl.environment import attribute_of, in_fitting_vector, in_vector
 from sb3_tbc.tbc_hrl.flat_replay import TerminatingHerReplayBuffer
-from sb3_tbc.tbc_hrl.former_settings import check_sb3_names
+from sb3_tbc.tbc_hrl.former_settings import check_sb3_names, without_neutral
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
@@ -42,6 +40,7 @@ SelfFlatSAC = TypeVar("SelfFlatSAC", bound="FlatSAC")
 
 CYCLE = 100
 """Environment steps between two bursts of updates."""
+_NO_BUFFER: Any = object()
 
 
 class FlatSAC(PlainAlgorithm, SAC):
@@ -64,7 +63,8 @@ class FlatSAC(PlainAlgorithm, SAC):
 
     @takes(FlatArguments)
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str, **arguments: object) -> None:
-        check_sb3_names(arguments)
+        refuse_policy(policy, self.policy_aliases)
+        check_sb3_names(arguments := without_neutral(arguments))
         sb3, settings = SB3Arguments.taken_from(arguments)
         config = self.config_class.from_dict(settings)
         self.settings = config.to_dict()
@@ -105,16 +105,29 @@ class FlatSAC(PlainAlgorithm, SAC):
         )
         if self.env is not None:
             check_goal_space(self.env.observation_space, self.env.action_space)
+            refuse_vec_normalize(self.env)
             check_goal_test(self.env, infos=[{}] * TRIED)
         if by_event and self.env is not None:
             check_goal_strategy(config.goal_strategy, attribute_of(self.env, "subgoals"))
         if sb3._init_setup_model:
             self._setup_model()
 
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """A vector of environments; single ones in one whose episodes can be resumed."""
-        return SAC._wrap_env(in_goal_vec_env(env) if monitor_wrapper else env, verbose, monitor_wrapper)
+    _wrap_env = staticmethod(in_vector)
+
+    def _setup_model(self) -> None:
+        """Build the networks; without an environment there is no hindsight replay, and the agent can only act."""
+        if self.env is None:
+            self.replay_buffer = _NO_BUFFER  # so that SB3 makes none
+        super()._setup_model()
+        if self.replay_buffer is _NO_BUFFER:
+            self.replay_buffer = None
+
+    def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
+        """Learn in another environment from now on, see SB3.
+
+        :raises ValueError: if the environment does not fit the agent
+        """
+        super().set_env(in_fitting_vector(env, self), force_reset)
 
     def learn(
         self: SelfFlatSAC,
@@ -137,6 +150,7 @@ class FlatSAC(PlainAlgorithm, SAC):
         if self.env is None:
             raise ValueError("learn needs an environment: pass env to load, or call set_env first")
         resumed, self._resumed = {} if reset_num_timesteps else self._resumed, {}
+        anew = reset_num_timesteps or self._last_obs is None  # then SB3 resets the environments
         total_timesteps, callback = self._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
@@ -148,13 +162,11 @@ class FlatSAC(PlainAlgorithm, SAC):
         record_settings(self, self.settings)
         if resumed and not resume.set_flat_state(self, self.env, resumed):
             self.close_running_episodes()
-        self._guarded = GuardedVecEnv(
-            with_episode_limit(self.env),
-            self.on_bad_step,
-            self._her_buffer().steps(),
-            self._last_obs,  # type: ignore[arg-type]
-        )
+        before = None if anew or resumed or self._guarded is None else self._guarded.guard
+        self._guarded = GuardedVecEnv(with_episode_limit(self.env), self.on_bad_step, self._her_buffer().steps())
         self._guarded.guard.begin(self._last_obs)  # type: ignore[arg-type]
+        if not anew:
+            self._guarded.guard.go_on(self._last_obs, before)  # type: ignore[arg-type]
         callback.on_training_start(locals(), globals())
         while True:
             if self.num_timesteps - self._updated_at >= CYCLE:

@@ -38,6 +38,9 @@ class ForeignHigh:
         unit, _ = self.algorithm.predict(observations, deterministic=deterministic)
         return np.clip(unit, -1.0, 1.0).astype(np.float32), states
 
+    def notice_changes(self) -> None:
+        """Nothing: the algorithm acts from its weights themselves."""
+
 
 def refuse_reconsidering(rules: OptionRules) -> None:
     """Check that an agent's high level can be replaced by another algorithm.
@@ -56,9 +59,15 @@ def put_together(high: BaseAlgorithm, low: Agent) -> Agent:
     """A copy of an agent whose options another algorithm proposes.
 
     :param low: a :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`
-    :raises ValueError: if the algorithm's observations or actions are not those of the agent's high level, or that
-        high level ends windows before their time
+    :raises ValueError: if the algorithm's observations or actions are not those of the agent's high level, or were
+        normalised; or that high level ends windows before their time
     """
+    if not isinstance(low, TwoLevelSaving):
+        raise ValueError(f"low must be a TBCHRL, whose low level executes the options, got {type(low).__name__}")
+    if high.get_vec_normalize_env() is not None:
+        raise ValueError(
+            "high was trained behind VecNormalize, whose statistics are no part of it: train it on OptionEnv as it is"
+        )
     views, space = low.policy.views, low.observation_space
     refuse_reconsidering(low.policy.rules)
     wanted = views.high_space(cast(spaces.Dict, space)), views.high_action_space()

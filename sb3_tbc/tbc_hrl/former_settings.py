@@ -38,6 +38,28 @@ OF_SB3_ALONE = {
 """Arguments of Stable-Baselines3's SAC that there are not here, and what there is."""
 
 
+NEUTRAL: Plain = {
+    "action_noise": None,
+    "use_sde": False,
+    "sde_sample_freq": -1,
+    "use_sde_at_warmup": False,
+    "replay_buffer_class": None,
+    "replay_buffer_kwargs": None,
+    "optimize_memory_usage": False,
+    "n_steps": 1,
+}
+"""Values of them that ask for nothing: Stable-Baselines3's defaults, which scripts and wrappers hand on."""
+
+
+def without_neutral(given: PlainMapping) -> Plain:
+    """Arguments without those of Stable-Baselines3 that ask for nothing."""
+    return {name: value for name, value in given.items() if name not in NEUTRAL or _asks(value, NEUTRAL[name])}
+
+
+def _asks(value: object, neutral: object) -> bool:
+    return type(value) is not type(neutral) or value != neutral
+
+
 def check_sb3_names(given: PlainMapping) -> None:
     """Refuse an argument of Stable-Baselines3 that has no counterpart.
 

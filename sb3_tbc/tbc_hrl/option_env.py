@@ -7,12 +7,15 @@ from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, FloatArray
-from sb3_tbc.smdp.episode_limit import ANNOUNCE, LastWindow, with_episode_limit
+from sb3_tbc.errors import EnvironmentFault, NonFiniteError
+from sb3_tbc.smdp.episode_limit import ANNOUNCE, BAD_STEP, CopyableVecEnvWrapper, LastWindow, with_episode_limit
+from sb3_tbc.smdp.finite import not_finite
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
 from sb3_tbc.smdp.options import OptionClock
 from sb3_tbc.smdp.spaces import GoalObservation
@@ -22,7 +25,7 @@ from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 Indices = NDArray[np.intp]
 
 
-class OptionEnv(VecEnvWrapper):
+class OptionEnv(CopyableVecEnvWrapper):
     """One step is one option: the action is a subgoal with its time budget, which a trained low level executes.
 
     Observations are what the high level of an agent sees, one flat vector; actions are in [-1, 1]. A step's reward is
@@ -45,6 +48,11 @@ class OptionEnv(VecEnvWrapper):
     """
 
     def __init__(self, venv: VecEnv, agent: TBCHRL, deterministic: bool = True, seed: int | None = None) -> None:
+        if not isinstance(venv, VecEnv) or not isinstance(agent, TBCHRL):
+            raise ValueError(
+                "OptionEnv needs a vector of environments and a TBCHRL, got "
+                f"{type(venv).__name__} and {type(agent).__name__}; DummyVecEnv([lambda: env]) makes a vector"
+            )
         if isinstance(venv, VecEnvWrapper):
             raise ValueError(
                 f"OptionEnv steps each environment by itself, past {type(venv).__name__}: give it the DummyVecEnv or "
@@ -52,6 +60,7 @@ class OptionEnv(VecEnvWrapper):
             )
         refuse_reconsidering(agent.rules)
         space = check_goal_space(venv.observation_space, venv.action_space)
+        check_for_correct_spaces(venv, agent.observation_space, agent.action_space)
         policy = agent.policy
         super().__init__(
             with_episode_limit(venv),
@@ -103,16 +112,14 @@ class OptionEnv(VecEnvWrapper):
         self._membrane[where] = 0.0
 
     def _begin(self) -> None:
-        """Start the options that were asked for, and tell the environments which are the last of their episodes."""
+        """Start the options that were asked for; an event ends the last of an episode."""
         schedule, everywhere = self.policy.schedule, np.arange(self.num_envs)
         unit = self._actions if schedule is None else schedule(self._actions, self._seen)
         self.clock.begin(everywhere, unit)
-        rules = self.policy.rules
-        for index in np.flatnonzero(self.clock.used >= rules.max_options):
-            steps = max(1, math.ceil(self.clock.time_budget[index]))
-            subgoal = self.clock.subgoal[index].copy() if rules.ends_when_reached else None
-            window = LastWindow(steps, self.policy.views.subgoals, subgoal, math.ceil(rules.dt_min))
-            self.venv.env_method(ANNOUNCE, window, indices=[int(index)])
+        subgoals = self.policy.views.subgoals
+        if subgoals.event is not None:
+            for index in np.flatnonzero(self.clock.used >= self.policy.rules.max_options):
+                self.venv.env_method(ANNOUNCE, LastWindow(False, subgoals), indices=[int(index)])
 
     def _act(self, live: Indices) -> AnyArray:
         """The low level's actions in the environments whose option is running."""
@@ -126,11 +133,36 @@ class OptionEnv(VecEnvWrapper):
 
     def _step_one(self, index: int, action: AnyArray) -> tuple[float, bool, Plain]:
         """One step of one environment: its reward, whether its episode is over, its info."""
+        if self.clock.used[index] >= self.policy.rules.max_options:
+            self._announce_end(index)
         observation, reward, terminated, truncated, info = self.venv.env_method("step", action, indices=[index])[0]
         for key in GOAL_KEYS:
             self._seen[key][index] = observation[key]
+        self._refuse_bad(index, float(reward), info)
         over = bool(terminated or truncated)
         return float(reward), over, {**info, "TimeLimit.truncated": over and not terminated}
+
+    def _announce_end(self, index: int) -> None:
+        """Tell an environment that its episode ends with this step, or if this step reaches the subgoal."""
+        step, rules = self.clock.elapsed[index] + 1, self.policy.rules
+        if step >= self.clock.time_budget[index]:
+            self.venv.env_method(ANNOUNCE, LastWindow(True), indices=[index])
+        elif rules.ends_when_reached and step == max(1, math.ceil(rules.dt_min)):
+            window = LastWindow(False, self.policy.views.subgoals, self.clock.subgoal[index].copy())
+            self.venv.env_method(ANNOUNCE, window, indices=[index])
+
+    def _refuse_bad(self, index: int, reward: float, info: Plain) -> None:
+        """Let nothing through that is not finite, or of another shape.
+
+        :raises EnvironmentFault: if a value has another shape than it should
+        :raises NonFiniteError: if one is not finite
+        """
+        step = int(self.clock.elapsed[index]) + 1
+        if BAD_STEP in info:
+            raise EnvironmentFault(f"environment {index}, step {step} of its option: {info[BAD_STEP]}")
+        wrong = not_finite(index, self._seen) or (None if math.isfinite(reward) else f"its reward is {reward}")
+        if wrong is not None:
+            raise NonFiniteError(f"environment {index}, step {step} of its option: {wrong}")
 
     def _close(self, index: int, rewards: list[float], over: bool, info: Plain) -> float:
         """Reward of the option that ended; begins a new episode where that is over, too."""

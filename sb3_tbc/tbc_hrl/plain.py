@@ -250,7 +250,7 @@ READERS: dict[str, Callable[..., object]] = {
     "number": _read_scalar,
     "array": _read_array,
     "box": _read_box,
-    "spaces": lambda parts: spaces.Dict(OrderedDict(parts)),  # of a plain dict it would sort the keys
+    "spaces": lambda parts: spaces.Dict(list(parts.items())),  # of a dictionary it would sort the keys
     "unit": lambda name: TrainFrequencyUnit[name],
     "train_freq": TrainFreq,
     "tuple": lambda items: tuple(items),

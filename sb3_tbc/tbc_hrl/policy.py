@@ -112,6 +112,7 @@ class TBCPolicy(BasePolicy):
         """
         batch, single = self._as_batch(observation)
         n = len(batch["observation"])
+        self.actor.notice_changes()
         clock, membrane = self._unpacked(n, state)
         starts = np.ones(n, bool) if state is None else np.zeros(n, bool)
         if episode_start is not None:

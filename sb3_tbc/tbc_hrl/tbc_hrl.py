@@ -20,23 +20,15 @@ from sb3_tbc.settings import hints
 from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.goal_spaces import check_goal_space
 from sb3_tbc.smdp.goal_test import check_goal_test
-from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep
 from sb3_tbc.smdp.hindsight import GoalTest, check_goal_strategy
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.smdp.rewards import LowLevelReward
 from sb3_tbc.smdp.views import LevelViews
-from sb3_tbc.tbc_hrl import assembly, resume
+from sb3_tbc.tbc_hrl import assembly, calls, resume
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
-from sb3_tbc.tbc_hrl.calls import (
-    OF_A_LEVEL,
-    explain_level_setting,
-    refuse_level_setting,
-    refuse_vec_normalize,
-    whole_steps,
-)
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
 from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import (
@@ -47,9 +39,9 @@ from sb3_tbc.tbc_hrl.diagnostics import (
     record_progress,
     record_settings,
 )
-from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, reward_range
+from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, in_fitting_vector, in_vector, reward_range
 from sb3_tbc.tbc_hrl.foreign_high import put_together
-from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings
+from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings, without_neutral
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.live_settings import LiveSettings
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
@@ -89,7 +81,8 @@ class TBCHRL(TwoLevelSaving):
 
     @takes(TBCArguments)
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **arguments: object) -> None:
-        check_top_names(arguments)
+        calls.refuse_policy(policy, self.policy_aliases)
+        check_top_names(arguments := without_neutral(arguments))
         others, settings = HierarchyArguments.taken_from(arguments)
         config = self.config_class.from_dict(settings)
         super().__init__(
@@ -116,6 +109,7 @@ class TBCHRL(TwoLevelSaving):
         self.collector: Collector | None = None
         self._resumed: Plain = {}
         if others._init_setup_model:
+            calls.refuse_no_environment(env)
             self._setup_model()
 
     @property
@@ -132,15 +126,17 @@ class TBCHRL(TwoLevelSaving):
         return LiveSettings(name, self.settings[name], lambda key, value: self._change_setting(name, key, value))
 
     def _change_setting(self, name: str, key: str, value: object) -> None:
-        settings = {**self.settings, name: {**self.settings[name], key: value}}
-        self.config = self.config_class.from_dict(settings)
-        self.settings = self.config.to_dict()
+        self._change(name, {**self.settings[name], key: value})
         level, config = (self.high, self.config.high) if name == "high" else (self.low, self.config.low)
         if key == "learning_rate":
             level.learning_rate = learning_rate_of(config.learning_rate)
             level._setup_lr_schedule()
         elif key == "tau":
             level.tau = config.tau
+
+    def _change(self, name: str, value: object) -> None:
+        self.config = self.config_class.from_dict({**self.settings, name: value})
+        self.settings = self.config.to_dict()
 
     @property
     def dt_max(self) -> float:
@@ -158,14 +154,17 @@ class TBCHRL(TwoLevelSaving):
             """A setting by its name, as ``model.max_options``: short for ``model.config.max_options``."""
             if name in hints(type(self).config_class) and "config" in self.__dict__:
                 return getattr(self.config, name)
-            explain_level_setting(name)
+            calls.explain_level_setting(name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
         def __setattr__(self, name: str, value: object) -> None:
-            """Refuse what changes nothing: settings of a level, as SB3's agents of one level have them."""
-            if name in OF_A_LEVEL:  # set in every step: a call costs more than the look
-                refuse_level_setting(name, value)
-            super().__setattr__(name, value)
+            """Set a setting that can still change, see :data:`.CHANGEABLE_LATER`; refuse what would change nothing."""
+            if name in calls.OF_A_LEVEL:  # set in every step: a call costs more than the look
+                calls.refuse_level_setting(name, value)
+            elif name in calls.OF_THE_AGENT and "collector" in self.__dict__:
+                calls.refuse_fixed(name, value)
+                return self._change(name, value)
+            return super().__setattr__(name, value)
 
     # ------------------------------------------------------------------ set-up
 
@@ -228,7 +227,7 @@ class TBCHRL(TwoLevelSaving):
 
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""
-        refuse_vec_normalize(env)
+        calls.refuse_vec_normalize(env)
         if self.subgoals is None:
             self.subgoals = attribute_of(env, "subgoals")
         check_goal_strategy(self.config.goal_strategy, self.subgoals)
@@ -241,19 +240,14 @@ class TBCHRL(TwoLevelSaving):
         self.reward_range = reward_range(env)
         check_goal_test(env)
 
-    @staticmethod
-    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
-        """A vector of environments; single ones in one whose episodes can be resumed."""
-        return BaseAlgorithm._wrap_env(in_goal_vec_env(env) if monitor_wrapper else env, verbose, monitor_wrapper)
+    _wrap_env = staticmethod(in_vector)
 
     def set_env(self, env: GymEnv, force_reset: bool = True) -> None:
         """Learn in another environment from now on, see SB3; episodes that run in the present one are abandoned.
 
         :raises ValueError: if the environment does not fit the agent
         """
-        if isinstance(env, VecEnv):
-            refuse_vec_normalize(env)
-        super().set_env(env, force_reset)
+        super().set_env(in_fitting_vector(env, self), force_reset)
         self.collector, self._resumed = None, {}
 
     # ------------------------------------------------------------------ learning
@@ -289,7 +283,7 @@ class TBCHRL(TwoLevelSaving):
         """
         self._refuse_foreign_high("learn")
         self.config.warn_before_learning()
-        total_timesteps = whole_steps(total_timesteps)
+        total_timesteps = calls.whole_steps(total_timesteps)
         if self.env is None:
             raise ValueError("learn needs an environment: pass env to load, or call set_env first")
         resumed, self._resumed = {} if reset_num_timesteps else self._resumed, {}

@@ -8,8 +8,9 @@ temporary folder and run as they are; what differs is what they are run with:
 * One algorithm of each test (SAC, where it is used) is one of ours. Settings that SB3 gives to an agent go to both of
   its levels; those that no level has are left out, or the case is skipped where it is about them.
 * Environments become goal environments: the observation is ``observation``, its first two entries the achieved goal.
-* Tests of images, of discrete actions and of what only SB3's own algorithms have are left out, see
-  ``tests_left_out.py``, which says why for each.
+* Tests of SAC that ask for what there is not here on purpose are run with their arguments as they are: each case must
+  pass or be refused in one line. Tests without SAC about what another algorithm has (PPO's clipping, DQN's target
+  network) are run as they are. ``tests_apart.py`` names both.
 """
 
 from __future__ import annotations
@@ -25,11 +26,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from tests_apart import LEFT_OUT, REFUSED, UNTOUCHED
+
 ALGORITHMS = ("tbc-hrl", "hits", "hac")
 
 
 def run(checkout: Path, algorithm: str, only: str, more: list[str]) -> dict[str, Any]:
-    """Run the suite with one algorithm; how each case ends, why those that fail do, and what is left out."""
+    """Run the suite with one algorithm; how each case ends, and why those end so that do not pass."""
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder) / "result.json"
         shutil.copytree(checkout / "tests", Path(folder) / "tests")
@@ -49,16 +52,26 @@ def run(checkout: Path, algorithm: str, only: str, more: list[str]) -> dict[str,
         return told
 
 
-def print_table(outcomes: dict[str, list[str]], left_out: dict[str, str]) -> None:
-    """How many cases of each test pass, and which tests do not apply and why."""
-    run_at_all = {name: ends for name, ends in outcomes.items() if set(ends) != {"skipped"}}
-    for name, ends in sorted(run_at_all.items()):
-        print(f"{name}: {', '.join(f'{count} {end}' for end, count in collections.Counter(ends).items())}")
-    for name, reason in sorted(left_out.items()):
-        print(f"left out: {name}: {reason}")
-    passed = [name for name, ends in run_at_all.items() if "failed" not in ends]
-    cases = [end for ends in run_at_all.values() for end in ends if end != "skipped"]
-    print(f"{len(passed)} of {len(run_at_all)} tests pass, {cases.count('passed')} of {len(cases)} cases")
+def print_table(outcomes: dict[str, list[str]]) -> None:
+    """How the cases of each test end, why what is not here is not, and the totals."""
+    outcomes = {name: [end for end in ends if end != "skipped"] for name, ends in outcomes.items()}
+    outcomes = {name: ends for name, ends in outcomes.items() if ends}
+    for name, ends in sorted(outcomes.items()):
+        reason = f" ({REFUSED[name]})" if "refused" in ends else " (as it is)" if name in UNTOUCHED else ""
+        print(f"{name}: {', '.join(f'{count} {end}' for end, count in collections.Counter(ends).items())}{reason}")
+    for name, reason in sorted(LEFT_OUT.items()):
+        print(f"not run: {name}: {reason}")
+    ours = {name: ends for name, ends in outcomes.items() if name not in UNTOUCHED}
+    print(f"with our agents: {totals(ours)}")
+    print(f"without an algorithm that they replace: {totals({n: e for n, e in outcomes.items() if n in UNTOUCHED})}")
+
+
+def totals(outcomes: dict[str, list[str]]) -> str:
+    """Numbers of tests that pass in all cases, are refused in some and pass in the others, and fail; and of cases."""
+    counts = collections.Counter(next((e for e in ("failed", "refused") if e in ends), "passed")
+                                 for ends in outcomes.values())  # fmt: skip
+    cases = collections.Counter(end for ends in outcomes.values() for end in ends)
+    return ", ".join(f"{counts[end]} tests {end} ({cases[end]} cases)" for end in ("passed", "refused", "failed"))
 
 
 def main() -> None:
@@ -69,15 +82,13 @@ def main() -> None:
     parser.add_argument("--only", default="", help="as pytest's -k")
     options, more = parser.parse_known_args()
     outcomes: dict[str, list[str]] = collections.defaultdict(list)
-    left_out: dict[str, str] = {}
     for algorithm in options.algo or ALGORITHMS:
         told = run(options.checkout, algorithm, options.only, more)
-        left_out |= told["not_applicable"]
         for name, ends in told["results"].items():
             outcomes[name] += ends
         for case, why in told["why"].items():
             print(f"{algorithm}: {case}: {why}")
-    print_table(outcomes, left_out)
+    print_table(outcomes)
 
 
 if __name__ == "__main__":

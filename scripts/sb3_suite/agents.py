@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 from goal_envs import AsGoalEnv
-from tests_left_out import BUFFER, ON_POLICY, SDE
+from tests_apart import BUFFER, SDE
 
 from sb3_tbc import HAC, TBCHRL, HiTS
 
@@ -22,9 +22,16 @@ UPDATES = {"SAC": 1.0, "TD3": 1.0, "DDPG": 1.0, "DQN": 1.0, "A2C": 0.2, "PPO": 0
 """Updates per step, by what is replaced, where a test does not say."""
 
 
-def translated(arguments: dict[str, Any]) -> dict[str, Any]:
-    """SB3's arguments for an agent of one level as those of one with two; a case that needs others is skipped."""
+def translated(arguments: dict[str, Any], as_given: bool = False) -> dict[str, Any]:
+    """SB3's arguments for an agent of one level as those of one with two; a case that needs others is skipped.
+
+    :param as_given: hand on what there is not here, to be refused
+    """
     given = dict(arguments)
+    if as_given:
+        level = {name: given.pop(name) for name in OF_A_LEVEL if name in given}
+        level |= {"policy_kwargs": given.pop("policy_kwargs")} if given.get("policy_kwargs") else {}
+        return given | ({"high": dict(level), "low": dict(level)} if level else {})
     if given.pop("use_sde", False):
         pytest.skip(SDE)
     if given.pop("optimize_memory_usage", False):
@@ -56,7 +63,7 @@ def _networks(policy_kwargs: dict[str, Any]) -> dict[str, Any]:
     networks = {name: value for name, value in policy_kwargs.items() if name not in OF_IMAGES}
     shape = networks.get("net_arch", [])
     if any(isinstance(part, dict) for part in shape) or "vf" in shape:
-        pytest.skip(ON_POLICY)
+        pytest.skip("networks of on-policy algorithms")
     if isinstance(shape, dict) and len(shape) == 1:
         networks["net_arch"] = {"qf": [64, 64], **shape}
     return networks
@@ -69,15 +76,18 @@ class Adapted:
     """SB3's algorithm, under whose name TensorBoard's files are expected."""
     wired: bool
     """Whether the low level may be a circuit."""
+    as_given: bool
+    """Whether arguments that there are not here are handed on."""
 
     def __init__(self, policy: Any, env: Any = None, **arguments: Any) -> None:
         if arguments.get("_init_setup_model", True):
             arguments = self._ours(arguments)
-            policy = policy if is_goal_env(env) else "MultiInputPolicy"
+            as_it_is = is_goal_env(env) or policy not in ("MlpPolicy", "MultiInputPolicy")
+            policy = policy if as_it_is else "MultiInputPolicy"
         super().__init__(policy, env, **arguments)  # type: ignore[call-arg]
 
     def _ours(self, arguments: dict[str, Any]) -> dict[str, Any]:
-        given = translated(arguments)
+        given = translated(arguments, self.as_given)
         levels = {name: {"batch_size": 16, "buffer_size": 20_000, **given.pop(name, {})} for name in ("high", "low")}
         if not self.wired:
             levels["low"]["policy_kwargs"] = {**levels["low"].get("policy_kwargs", {}), "ndbc": None}
@@ -94,7 +104,7 @@ class Adapted:
         custom = dict(custom_objects or {})
         moved = {name: custom.pop(name) for name in OF_A_LEVEL if name in custom}
         sb3 = {name: given.pop(name) for name in ("print_system_info", "force_reset", "verbose") if name in given}
-        return super().load(path, env, device, custom, **sb3, **translated({**moved, **given}))  # type: ignore[misc]
+        return super().load(path, env, device, custom, **sb3, **translated({**moved, **given}, cls.as_given))  # type: ignore[misc]
 
     def __getattr__(self, name: str) -> Any:
         if name in ("log_ent_coef", "ent_coef_tensor") and "low" in self.__dict__:
@@ -124,7 +134,7 @@ def is_goal_env(env: Any) -> bool:
 
 
 @functools.cache
-def ours(replaces: str, wired: bool) -> type[Any]:
+def ours(replaces: str, wired: bool, as_given: bool = False) -> type[Any]:
     """The algorithm that takes the place of one of SB3's in this process."""
     algorithm = {"tbc-hrl": TBCHRL, "hits": HiTS, "hac": HAC}[os.environ["SB3_SUITE_ALGO"]]
-    return type(algorithm.__name__, (Adapted, algorithm), {"replaces": replaces, "wired": wired})
+    return type(algorithm.__name__, (Adapted, algorithm), {"replaces": replaces, "wired": wired, "as_given": as_given})

@@ -7,6 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 
 from sb3_tbc import SubgoalSpace
 
@@ -17,6 +18,9 @@ class AsGoalEnv(gym.Wrapper):  # type: ignore[type-arg]
     :param env: an environment, a goal environment of other spaces than boxes included
     """
 
+    keeps_keys = False
+    """Whether the parts of observations that are dictionaries are shown beside the goals."""
+
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         super().__init__(env)
         self.is_goal = isinstance(env.observation_space, spaces.Dict) and "desired_goal" in env.observation_space.spaces
@@ -25,7 +29,9 @@ class AsGoalEnv(gym.Wrapper):  # type: ignore[type-arg]
         observed = spaces.Box(-np.inf, np.inf, flat.shape, np.float32)
         width = int(np.prod(raw["achieved_goal"].shape)) if self.is_goal else min(2, flat.shape[0])
         goal = spaces.Box(-np.inf, np.inf, (width,), np.float32)
-        self.observation_space = spaces.Dict(observation=observed, achieved_goal=goal, desired_goal=goal)
+        self.kept = dict(raw.spaces) if self.keeps_keys and isinstance(raw, spaces.Dict) else {}
+        goals = {"observation": observed, "achieved_goal": goal, "desired_goal": goal}
+        self.observation_space = spaces.Dict({**self.kept, **goals})
         self.discrete = isinstance(env.action_space, spaces.Discrete)
         if self.discrete:
             self.action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
@@ -60,26 +66,33 @@ class AsGoalEnv(gym.Wrapper):  # type: ignore[type-arg]
         if self.is_goal:
             return {key: np.asarray(part, dtype=np.float32).ravel() for key, part in observation.items()}
         flat = np.asarray(spaces.flatten(raw, observation), dtype=np.float32)
-        return {"observation": flat, "achieved_goal": flat[:width].copy(), "desired_goal": np.zeros(width, np.float32)}
+        goals = {"achieved_goal": flat[:width].copy(), "desired_goal": np.zeros(width, np.float32)}
+        return {**{key: observation[key] for key in self.kept}, "observation": flat, **goals}
 
     def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
         """0 at the goal, -1 elsewhere."""
         return np.where(np.abs(np.asarray(achieved_goal) - desired_goal).max(axis=-1) < 0.2, 0.0, -1.0)
 
 
-def registered_again(env_id: str) -> None:
-    """Let an id of Gymnasium give a goal environment."""
-    spec = gym.spec(env_id)
-    raw_id = f"raw/{env_id}"
-    if raw_id in gym.registry:
-        return
-    gym.register(raw_id, entry_point=spec.entry_point, kwargs=spec.kwargs)
-    gym.registry.pop(env_id)
-    gym.register(
+def goal_spec(env_id: str) -> EnvSpec:
+    """What an id of Gymnasium is to mean, so that it gives a goal environment."""
+    spec, raw_id = gym.spec(env_id), f"raw/{env_id}"
+    if raw_id not in gym.registry:
+        gym.register(raw_id, entry_point=spec.entry_point, kwargs=spec.kwargs)
+    return EnvSpec(
         env_id,
         entry_point=lambda **kwargs: AsGoalEnv(gym.make(raw_id, **kwargs)),
         max_episode_steps=spec.max_episode_steps,
     )
+
+
+class Limited(gym.wrappers.TimeLimit):  # type: ignore[type-arg]
+    """A time limit that shows the attributes of what is in it."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "env":
+            raise AttributeError(name)
+        return getattr(self.env, name)
 
 
 def as_goal_env(env: Any) -> Any:
@@ -88,7 +101,7 @@ def as_goal_env(env: Any) -> Any:
     if isinstance(space, spaces.Dict) and any(isinstance(part, spaces.Dict) for part in space.spaces.values()):
         return env
     goal = AsGoalEnv(env)
-    return goal if env.spec and env.spec.max_episode_steps else gym.wrappers.TimeLimit(goal, 100)
+    return goal if env.spec and env.spec.max_episode_steps else Limited(goal, 100)
 
 
 class Batch(dict):  # type: ignore[type-arg]

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import sys
+import traceback
 import types
 from pathlib import Path
 from typing import Any
@@ -17,15 +18,21 @@ import gymnasium as gym
 import pytest
 import stable_baselines3 as sb3
 from agents import ours
-from goal_envs import Batch, OurNumPy, as_goal_env, registered_again
+from goal_envs import AsGoalEnv, Batch, OurNumPy, as_goal_env, goal_spec
 from stable_baselines3.common.vec_env import DummyVecEnv
-from tests_left_out import NOT_APPLICABLE, RANDOM_WEIGHTS, REPLACES
+from tests_apart import LEFT_OUT, RANDOM_WEIGHTS, REFUSED, REPLACES, UNTOUCHED
 
+import sb3_tbc
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 
+OURS = Path(sb3_tbc.__file__).resolve().parent
 SB3 = ("SAC", "TD3", "DDPG", "A2C", "PPO", "DQN")
 """SB3's algorithms: the first that a test uses is replaced, with continuous actions first."""
 USED = re.compile(r"\b(A2C|DDPG|DQN|PPO|SAC|TD3|MODEL_LIST|MODEL_DICT|model_class|algo)\b")
+
+
+UNTOUCHED_WITH = "tbc-hrl"
+"""Tests that none of our algorithms takes part in are run once, together with this one."""
 
 
 def used_by(function: Any) -> set[str]:
@@ -47,20 +54,18 @@ def replaced_in(names: set[str]) -> str | None:
 
 def pytest_collection_modifyitems(config: Any, items: list[Any]) -> None:
     """Keep the tests that use an algorithm, once for each, and put ours into their parameters."""
-    config.left_out = {}
-    items[:] = [item for item in items if _applies(config, item)]
+    items[:] = [item for item in items if _applies(item)]
 
 
-def _applies(config: Any, item: Any) -> bool:
+def _applies(item: Any) -> bool:
     """Whether a case is to be run; if so, it is made ready."""
     key, names = key_of(item), used_by(item.function)
     name = REPLACES.get(key, replaced_in(names))
-    if name is None:
+    if name is None or key in LEFT_OUT:
         return False
-    if key in NOT_APPLICABLE:
-        config.left_out[key] = NOT_APPLICABLE[key]
-        return False
-    original, algorithm = getattr(sb3, name), ours(name, key not in RANDOM_WEIGHTS)
+    if key in UNTOUCHED:
+        return os.environ["SB3_SUITE_ALGO"] == UNTOUCHED_WITH
+    original, algorithm = getattr(sb3, name), ours(name, key not in RANDOM_WEIGHTS, key in REFUSED)
     params = item.callspec.params if hasattr(item, "callspec") else {}
     classes = [v for v in params.values() if isinstance(v, type) and v.__module__.startswith("stable_baselines3")]
     if (classes and original not in classes) or params.get("model_name", "sac") != "sac":
@@ -77,7 +82,15 @@ def _applies(config: Any, item: Any) -> bool:
 @pytest.fixture(autouse=True)
 def in_our_world(request: Any, monkeypatch: Any) -> None:
     """Put our algorithm, goal environments and their observations into a test's module."""
-    module, (names, algorithm) = request.module, request.node.replaces
+    if key_of(request.node) not in UNTOUCHED:
+        put_in(request.module, *request.node.replaces, monkeypatch)
+
+
+def put_in(module: Any, names: set[str], algorithm: type[Any], monkeypatch: Any) -> None:
+    """The same, for a module.
+
+    :param names: of SB3's algorithms that are replaced
+    """
     for name in names:
         for place in (module, getattr(module, "sb3", None)):
             if hasattr(place, name):
@@ -91,8 +104,9 @@ def in_our_world(request: Any, monkeypatch: Any) -> None:
         monkeypatch.setitem(module.MODEL_DICT, "sac", (algorithm, module.MODEL_DICT["sac"][1]))
     if "np" in vars(module):
         monkeypatch.setattr(module, "np", OurNumPy())
-    for env_id in ("Pendulum-v1", "CartPole-v1", "MountainCarContinuous-v0"):
-        registered_again(env_id)
+    monkeypatch.setattr(AsGoalEnv, "keeps_keys", algorithm.as_given)
+    for env_id in ("Pendulum-v1", "MountainCarContinuous-v0", *(() if algorithm.as_given else ("CartPole-v1",))):
+        monkeypatch.setitem(gym.registry, env_id, goal_spec(env_id))
 
 
 def forked(kind: type[Any]) -> type[Any]:
@@ -144,14 +158,30 @@ def pytest_runtest_makereport(item: Any, call: Any) -> Any:
     """Note how each case ends."""
     report = (yield).get_result()
     if call.when == "call" or (call.when == "setup" and report.outcome != "passed"):
-        RESULTS[key_of(item)].append(report.outcome)
-        if report.outcome != "passed":
-            WHY[item.nodeid] = (
-                str(report.longrepr)[-300:] if report.outcome == "skipped" else str(call.excinfo.value)[:300]
-            )
+        key, ended, why = key_of(item), report.outcome, ""
+        if ended == "skipped":
+            why = str(report.longrepr)[-300:]
+        elif ended == "failed":
+            refusal = refused_by(call.excinfo.value) if key in REFUSED else None
+            ended = "refused" if refusal else ended
+            why = refusal or str(call.excinfo.value)[:300]
+        RESULTS[key].append(ended)
+        if why:
+            WHY[item.nodeid] = f"{ended}: {why}"
+
+
+def refused_by(error: BaseException | None) -> str | None:
+    """The error of ours, of one line, that a test met, be it one that it did not expect; None if there is none."""
+    while error is not None:
+        frames = traceback.extract_tb(error.__traceback__)
+        raised_here = bool(frames) and OURS in Path(frames[-1].filename).resolve().parents
+        if raised_here and isinstance(error, ValueError | TypeError | AttributeError) and "\n" not in str(error):
+            return str(error)
+        error = error.__cause__ or error.__context__
+    return None
 
 
 def pytest_sessionfinish(session: Any) -> None:
     """Write what happened for the process that asked for it."""
-    told = {"results": RESULTS, "why": WHY, "not_applicable": getattr(session.config, "left_out", {})}
+    told = {"results": RESULTS, "why": WHY}
     Path(os.environ["SB3_SUITE_RESULT"]).write_text(json.dumps(told))

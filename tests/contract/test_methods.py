@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -17,6 +18,8 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from sb3_tbc.errors import ConfigError
 
 OBSERVATION = corridor().reset(seed=0)[0]
 
@@ -127,6 +130,38 @@ def test_settings_change_while_loading(algo: str, tmp_path: Path) -> None:
     assert loaded.dt_max == 5.0
 
 
+@shows("yes", "load without env")
+@every_algorithm
+def test_an_agent_acts_without_an_environment(algo: str, tmp_path: Path) -> None:
+    model = make(algo)
+    model.save(tmp_path / "a.zip")
+    loaded = ALGORITHMS[algo].load(tmp_path / "a.zip")
+    np.testing.assert_array_equal(act(loaded), act(model))
+    with pytest.raises(ValueError, match="needs an environment"):
+        loaded.learn(10)
+
+
+@shows("yes", "model.gradient_ratio = ..., model.learning_starts = ...")
+@two_levels
+def test_some_settings_can_be_set(algo: str) -> None:
+    model: Any = make(algo, gradient_ratio=0.0)
+    model.gradient_ratio, model.learning_starts = 0.5, 100
+    model.learn(200)
+    assert 0 < model.low._n_updates <= 50
+    assert model.settings["gradient_ratio"] == 0.5
+    with pytest.raises(ValueError, match="gradient_ratio"):
+        model.gradient_ratio = -1.0
+
+
+@shows("refused", "model.<other setting> = ...")
+@two_levels
+@pytest.mark.parametrize("name", ["max_options", "train_freq", "action_noise", "n_hindsight_goals"])
+def test_other_settings_are_not_taken_in_silence(algo: str, name: str) -> None:
+    model: Any = make(algo)
+    with pytest.raises(AttributeError, match=f"{name} is (fixed|nothing that can be set)"):
+        setattr(model, name, 3)
+
+
 @shows("refused", "load(<unknown>=)")
 @every_algorithm
 def test_loading_takes_nothing_that_it_does_not_know(algo: str, tmp_path: Path) -> None:
@@ -235,9 +270,25 @@ def test_the_policy_does_what_sb3s_does(algo: str) -> None:
     assert policy.squash_output
     assert policy.device.type == "cpu"
     assert policy(batch, deterministic=True).shape == (1, 1)
-    vector = policy.parameters_to_vector()
+    vector, before = policy.parameters_to_vector(), act(model)
     policy.load_from_vector(np.zeros_like(vector))
     assert not np.array_equal(policy.parameters_to_vector(), vector)
+    assert not np.array_equal(act(model), before)
+    policy.load_from_vector(vector)
+    np.testing.assert_array_equal(act(model), before)
+
+
+@shows("yes", "policy.parameters changed in place")
+@two_levels
+@pytest.mark.parametrize("how", ["no_grad", "data"])
+def test_weights_changed_by_hand_act(algo: str, how: str) -> None:
+    model = make(algo)
+    before = act(model)
+    for parameter in model.policy.parameters():
+        with th.no_grad():
+            (parameter.data if how == "data" else parameter).mul_(1.5)
+    assert not np.array_equal(act(model), before)
+    model.learn(60)
 
 
 @shows("not applicable", "policy.extract_features, policy.make_features_extractor")
@@ -263,8 +314,46 @@ def test_another_environment(algo: str) -> None:
         model.set_env(make_vec_env(corridor, 2))
 
 
+@shows("refused", "set_env(<unfit>)")
+@every_algorithm
+def test_an_environment_is_looked_at_when_it_is_set(algo: str) -> None:
+    class NoReward(gym.Wrapper):  # type: ignore[type-arg]
+        compute_reward = None
+
+    model = make(algo)
+    with pytest.raises(ConfigError, match="compute_reward"):
+        model.set_env(NoReward(corridor()))
+    for other in (corridor, [corridor()], None):
+        with pytest.raises(TypeError, match="must be an environment, the id of one, or a vector"):
+            model.set_env(other)  # type: ignore[arg-type]
+
+
+@shows("yes", "evaluate_policy(model, model.get_env())")
+@every_algorithm
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_evaluating_where_it_learns(algo: str, n_envs: int, caplog: Any) -> None:
+    """Two calls of learn with an evaluation between them: no stored episode is made of two."""
+    model: Any = make(algo, make_vec_env(lambda: corridor(0.9), n_envs), gradient_ratio=0.0)
+    for steps in (10, 20, 20, 33):  # within and at the end of an episode
+        model.learn(steps * n_envs, reset_num_timesteps=False)
+        evaluate_policy(model, model.get_env(), 2)
+    model.learn(60 * n_envs, reset_num_timesteps=False)
+    assert "reset by someone else" in caplog.text
+    if algo == "sac":
+        buffer, rows = model.replay_buffer, slice(model.replay_buffer.pos)
+        seen, then = (part["achieved_goal"][rows] for part in (buffer.observations, buffer.next_observations))
+        stored = buffer.ep_length[rows] > 0
+        moved = (then - seen)[stored]
+    else:
+        low = model.replay_buffer.low
+        data = low.data
+        moved = (data["next_local"] - data["local"])[: low.size(), :1]
+    assert len(moved)
+    assert np.abs(moved).max() < 0.11
+
+
 @shows("refused", "get_vec_normalize_env")
-@two_levels
+@every_algorithm
 def test_there_is_no_vec_normalize(algo: str) -> None:
     model = make(algo)
     assert model.get_vec_normalize_env() is None

@@ -13,7 +13,7 @@ from corridor import Corridor
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor
 
-from sb3_tbc.errors import EnvironmentFault
+from sb3_tbc.errors import ConfigError, EnvironmentFault
 from sb3_tbc.smdp.episode_limit import EpisodeLimit, LastWindow, LimitingVecEnv, with_episode_limit
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal
@@ -35,6 +35,11 @@ def far() -> gym.Env[Any, Any]:
 
 def monitored(file: str | None = None) -> gym.Env[Any, Any]:
     return Monitor(far(), file)
+
+
+def wrapped(file: str | None = None) -> gym.Env[Any, Any]:
+    """The monitor is not the outermost wrapper."""
+    return gym.wrappers.TimeLimit(monitored(file), 900)
 
 
 def hierarchical(venv: Any, **rules: Any) -> HierarchicalVecEnv:
@@ -69,6 +74,7 @@ VECTORS = {
     "wrapped twice": lambda: DummyVecEnv([lambda: Monitor(gym.wrappers.TimeLimit(far(), 900))] * 2),
     "processes": lambda: SubprocVecEnv([far, far], start_method="fork"),
     "monitored in processes": lambda: SubprocVecEnv([monitored, monitored], start_method="fork"),
+    "wrapped in processes": lambda: SubprocVecEnv([wrapped, wrapped], start_method="fork"),
 }
 
 
@@ -107,9 +113,11 @@ def test_all_kinds_of_vectors_give_the_same_episodes() -> None:
 
 
 def test_the_monitors_file_holds_every_episode(tmp_path: Any) -> None:
-    for name, kind in {"here": GoalVecEnv, "there": partial(SubprocVecEnv, start_method="fork")}.items():
+    there = partial(SubprocVecEnv, start_method="fork")
+    kinds = {"here": (GoalVecEnv, monitored), "there": (there, monitored), "beneath": (there, wrapped)}
+    for name, (kind, env) in kinds.items():
         path = tmp_path / name
-        venv = kind([partial(monitored, str(path))])
+        venv = kind([partial(env, str(path))])
         episodes, _ = episodes_of(hierarchical(venv), 40)
         venv.close()
         with path.with_suffix(".monitor.csv").open() as file:
@@ -148,6 +156,45 @@ def test_nothing_goes_past_a_wrapper_of_the_vector(window_end: str) -> None:
         assert sum(option.duration for option in episode.options) == episode.length
 
 
+class Skipping(gym.Wrapper):
+    """Four of the task's steps make one of the agent's."""
+
+    def step(self, action: Any) -> Any:
+        for _ in range(4):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            if terminated or truncated:
+                break
+        return observation, reward, terminated, truncated, info
+
+
+@pytest.mark.parametrize("there", [False, True])
+@pytest.mark.parametrize("rules", [{}, {"window_end": "reached", "dt_min": 1.5}], ids=["timed", "reached"])
+def test_windows_count_the_agents_steps_and_not_frames(there: bool, rules: dict[str, Any]) -> None:
+    kind = partial(SubprocVecEnv, start_method="fork") if there else DummyVecEnv
+    env = hierarchical(kind([lambda: Monitor(Skipping(far()))] * 2), **rules)
+    episodes, _ = episodes_of(env)
+    env.close()
+    options = [option for episode in episodes for option in episode.options]
+    assert all(episode.budget_exhausted and len(episode.options) == 3 for episode in episodes)
+    assert all(o.duration == max(1, np.ceil(o.time_budget)) or (rules and o.reached) for o in options)
+    assert len(episodes) > 5
+
+
+class WholeBatch(DummyVecEnv):
+    """A vector whose simulator cannot begin one episode alone."""
+
+    def env_method(self, method_name: str, *args: Any, **kwargs: Any) -> Any:
+        if method_name == "reset":
+            raise NotImplementedError
+        return super().env_method(method_name, *args, **kwargs)
+
+
+def test_a_vector_that_cannot_reset_one_environment_is_told_so() -> None:
+    env = hierarchical(LimitingVecEnv(WholeBatch([far, far])))
+    with pytest.raises(ConfigError, match="WholeBatch cannot reset one environment alone"):
+        episodes_of(env)
+
+
 def test_an_end_of_the_tasks_own_is_not_called_a_used_up_budget() -> None:
     env = hierarchical(DummyVecEnv([lambda: Corridor(4, goal=5.0)]))
     episodes, infos = episodes_of(env)
@@ -172,8 +219,10 @@ def test_the_limit_is_put_in_once_and_beneath_the_wrappers() -> None:
 def test_a_reset_forgets_what_was_announced() -> None:
     env = EpisodeLimit(far())
     env.reset(seed=0)
-    env.announce_last_window(LastWindow(2))
-    assert [env.step(np.zeros(1))[3] for _ in range(2)] == [False, True]
+    env.announce_last_window(LastWindow(False))
+    assert not any(env.step(np.zeros(1))[3] for _ in range(5))
+    env.announce_last_window(LastWindow(True))
+    assert env.step(np.zeros(1))[3]
     env.reset()
     assert not any(env.step(np.zeros(1))[3] for _ in range(5))
 

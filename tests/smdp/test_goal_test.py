@@ -10,6 +10,7 @@ from corridor import Corridor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.smdp.goal_spaces import said_success
 from sb3_tbc.smdp.goal_test import check_goal_test, goal_test_of
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 
@@ -45,3 +46,28 @@ def test_a_list_of_infos_is_tried_where_learning_gives_one() -> None:
         check_goal_test(DummyVecEnv([ReadsInfo]), infos=[{}] * 3)
     with pytest.raises(ConfigError, match="a list of empty ones"):
         FlatSAC("MultiInputPolicy", ReadsInfo())
+
+
+class InPlace(Corridor):
+    """Reckons in the arrays that it is given."""
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        achieved_goal -= desired_goal
+        return np.where(np.abs(achieved_goal)[..., 0] <= 0.05, 0.0, -1.0)
+
+
+def test_goals_must_not_be_changed_in_place() -> None:
+    with pytest.raises(ConfigError, match="changes the goals that it is given"):
+        check_goal_test(DummyVecEnv([InPlace]))
+
+
+@pytest.mark.parametrize(
+    ("info", "said"),
+    [
+        ({}, None), ({"is_success": None}, None), ({"is_success": "False"}, None), ({"is_success": np.nan}, None),
+        ({"is_success": np.bool_(True)}, True), ({"is_success": 0.0}, False), ({"success": np.array([1.0])}, True),
+        ({"is_success": False, "success": True}, False), ({"is_success": []}, None),
+    ],
+)  # fmt: skip
+def test_what_an_info_says_of_success(info: dict[str, Any], said: bool | None) -> None:
+    assert said_success(info) is said

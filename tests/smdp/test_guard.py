@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from corridor import Corridor
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
@@ -32,3 +34,39 @@ def test_what_was_seen_is_the_step_before_and_not_the_reset() -> None:
     assert step.seen["achieved_goal"][0, 0] == pytest.approx(0.1)
     assert step.infos[0]["terminal_observation"]["achieved_goal"][0] == pytest.approx(0.1)
     assert step.observation["achieved_goal"][0, 0] == 0.0
+
+
+def two_monitored() -> list:
+    return [lambda: Monitor(Corridor(goal=0.9))] * 2
+
+
+VECTORS = {
+    "here": lambda: GoalVecEnv(two_monitored()),
+    "dummy": lambda: DummyVecEnv(two_monitored()),
+    "processes": lambda: SubprocVecEnv(two_monitored(), start_method="fork"),
+    "bare processes": lambda: SubprocVecEnv([lambda: Corridor(goal=0.9)] * 2, start_method="fork"),
+}
+
+
+@pytest.mark.parametrize("kind", VECTORS)
+@pytest.mark.parametrize("before", [0, 3])
+def test_an_episode_that_someone_else_begins_is_none_of_the_agents(kind: str, before: int, caplog) -> None:
+    """Evaluating in the agent's own environments between two steps of it must not mix two episodes."""
+    venv = with_episode_limit(VECTORS[kind]())
+    guard = Guard(venv)
+    guard.reset()
+    actions, steps = np.ones((2, 1), np.float32), np.zeros(2, dtype=np.int64)
+    for number in range(before):
+        assert not guard.step(actions, steps + number).bad.any()
+    venv.reset()
+    venv.step(-actions)
+    step = guard.step(actions, steps + before)
+    assert step.bad.all()
+    assert step.dones.all()
+    np.testing.assert_allclose(step.seen["achieved_goal"][:, 0], 0.1 * before)
+    np.testing.assert_allclose(step.observation["achieved_goal"][:, 0], 0.0)
+    assert "reset by someone else" in caplog.text
+    after = guard.step(actions, steps)
+    assert not after.bad.any()
+    np.testing.assert_allclose(after.seen["achieved_goal"][:, 0], 0.1)
+    venv.close()

@@ -442,3 +442,36 @@ def test_a_maze_of_gymnasium_robotics():
     env.reset(seed=0)
     _, reward, _, _, info = env.step(env.action_space.sample())
     assert (reward, info["is_success"]) == (-1.0, False)
+
+
+class Scaled(Point):
+    """The same task in another unit of length; its second goal never changes."""
+
+    unit = 1.0
+
+    def _see(self):
+        seen = {key: self.unit * part for key, part in super()._see().items()}
+        seen["achieved_goal"][1] = seen["desired_goal"][1] = 0.4 * self.unit
+        return seen
+
+    def compute_reward(self, achieved_goal, desired_goal, info):
+        return super().compute_reward(np.asarray(achieved_goal) / self.unit, np.asarray(desired_goal) / self.unit, info)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e3])
+def test_bounds_do_not_depend_on_the_unit_of_length(unit):
+    expected, env = describe_goal_env(Scaled()).subgoals, Scaled()
+    env.unit = unit
+    found = describe_goal_env(env).subgoals
+    np.testing.assert_allclose(found.low / unit, expected.low, rtol=1e-6)
+    np.testing.assert_allclose(found.high / unit, expected.high, rtol=1e-6)
+    np.testing.assert_allclose(found.thresholds / unit, expected.thresholds, rtol=1e-3)
+
+
+def test_observations_that_are_not_finite_are_named():
+    class Nan(Point):
+        def _see(self):
+            return super()._see() | {"desired_goal": np.array([np.nan, 0.0])}
+
+    with pytest.raises(ValueError, match=r"'desired_goal'. of Nan is not finite"):
+        describe_goal_env(Nan())

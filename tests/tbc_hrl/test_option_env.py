@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from corridor import Corridor
+from gymnasium.spaces import Box
 from sb3_contrib import TQC, CrossQ
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_tbc import TBCHRL
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError
 from sb3_tbc.export.policy import extract
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.option_env import OptionEnv
@@ -132,3 +135,54 @@ def test_any_algorithm_is_the_high_level(agent: TBCHRL, algorithm: Any) -> None:
 def test_levels_that_do_not_fit_are_refused(agent: TBCHRL) -> None:
     with pytest.raises(ValueError, match="train it in OptionEnv"):
         TBCHRL.from_levels(SAC("MlpPolicy", "Pendulum-v1", **SMALL), agent)
+
+
+def test_it_can_be_copied_and_so_can_what_was_put_together(agent: TBCHRL) -> None:
+    env = options(agent)
+    env.reset()
+    actions = np.zeros((2, 2))
+    twin = copy.deepcopy(env)
+    np.testing.assert_array_equal(env.step(actions)[0], twin.step(actions)[0])
+    together = TBCHRL.from_levels(PPO("MlpPolicy", env, n_steps=8, batch_size=8), agent)
+    seen = Corridor().reset(seed=0)[0]
+    np.testing.assert_array_equal(
+        copy.deepcopy(together).predict(seen, deterministic=True)[0], together.predict(seen, deterministic=True)[0]
+    )
+
+
+class Bad(Corridor):
+    """Its third step is no number, or has no goal."""
+
+    missing = False
+
+    def step(self, action: Any) -> Any:
+        observation, *rest = super().step(action)
+        if self.steps == 3:
+            observation["achieved_goal"] = observation["achieved_goal"] * np.nan
+            if self.missing:
+                del observation["achieved_goal"]
+        return observation, *rest
+
+
+@pytest.mark.parametrize(("missing", "words"), [(False, "is not finite"), (True, "got nothing")])
+def test_nothing_wrong_gets_through(agent: TBCHRL, missing: bool, words: str) -> None:
+    env = OptionEnv(DummyVecEnv([Bad]), agent)
+    env.venv.set_attr("missing", missing)
+    env.envs[0].unwrapped.missing = missing
+    env.reset()
+    with pytest.raises((NonFiniteError, EnvironmentFault), match=f"environment 0, step 3 of its option: .*{words}"):
+        env.step(np.array([[0.0, 1.0]]))
+
+
+def test_what_does_not_fit_is_refused(agent: TBCHRL) -> None:
+    high = PPO("MlpPolicy", VecNormalize(options(agent)), n_steps=8, batch_size=8)
+    with pytest.raises(ValueError, match="trained behind VecNormalize"):
+        TBCHRL.from_levels(high, agent)
+    with pytest.raises(ValueError, match="low must be a TBCHRL"):
+        TBCHRL.from_levels(agent, high)  # type: ignore[arg-type]
+    for venv, given in ((Corridor(), agent), (make_vec_env(Corridor, 1), high)):
+        with pytest.raises(ValueError, match="needs a vector of environments and a TBCHRL"):
+            OptionEnv(venv, given)  # type: ignore[arg-type]
+    other = make_vec_env(lambda: gym.wrappers.TransformAction(Corridor(), lambda a: a[:1], Box(-1, 1, (2,))), 1)
+    with pytest.raises(ValueError, match="Action spaces do not match"):
+        OptionEnv(other, agent)
