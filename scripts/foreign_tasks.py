@@ -47,6 +47,10 @@ GOAL = 0.95
 """Success rate of an evaluation that counts as learned."""
 
 
+AFTERWARDS = 2
+"""Evaluations after the first of :data:`GOAL`, to see how well an agent does when it has learned."""
+
+
 class Plan(NamedTuple):
     """How long agents learn on a task."""
 
@@ -54,11 +58,12 @@ class Plan(NamedTuple):
     every: int  # steps between two evaluations
     seeds: tuple[int, ...]
     minutes: float = 60.0  # of CPU time
+    to_goal: bool = False  # whether a run ends soon after the first evaluation of GOAL
 
 
 TASKS = {
-    "FetchReach-v4": Plan(12_000, 1_000, tuple(range(100, 105))),
-    "PointMaze_UMaze-v3": Plan(14_000, 1_000, tuple(range(100, 105))),
+    "FetchReach-v4": Plan(12_000, 1_000, tuple(range(100, 105)), to_goal=True),
+    "PointMaze_UMaze-v3": Plan(20_000, 1_000, tuple(range(100, 105)), to_goal=True),
     "FetchPush-v4": Plan(200_000, 5_000, (100,), 10.0),
     "AntMaze_UMaze-v5": Plan(200_000, 5_000, (100,), 10.0),
 }
@@ -104,7 +109,8 @@ class Watch(BaseCallback):
         self.points.append(Point(self.num_timesteps, round(spent, 1), success, length))
         print(*self.points[-1], file=sys.stderr, flush=True)
         self.started += cpu_seconds() - paused
-        return spent < 60 * self.plan.minutes
+        learned = self.plan.to_goal and any(p.success >= GOAL for p in self.points[: -AFTERWARDS or None])
+        return spent < 60 * self.plan.minutes and not learned
 
 
 def two_levels(model: BaseAlgorithm, env: VecEnv, seed: int) -> tuple[float, float | None]:
@@ -219,7 +225,7 @@ def text_of(found: Plain) -> str:
 def update(page: Path, text: str) -> None:
     """Put the tables into the page, between its marks."""
     old = page.read_text(encoding="utf-8")
-    new = re.sub(r"(<!-- foreign -->\n).*?(\n<!-- end -->)", lambda m: m[1] + text + m[2], old, flags=re.DOTALL)
+    new = re.sub(r"(<!-- foreign -->\n).*?(<!-- end -->)", lambda m: f"{m[1]}{text}\n{m[2]}", old, flags=re.DOTALL)
     write_atomic(page, new)
 
 

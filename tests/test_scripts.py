@@ -125,3 +125,42 @@ def test_commands_outside_of_the_ledger_are_understood() -> None:
             space = restrict(load_space("tbc-hrl", args.env, path), base, args.search, {})
             assert {"low.learning_rate", "tau", "ndbc.sub_steps", "max_options"} <= set(space)
             assert "memory" not in space
+
+
+def test_the_committed_foreign_tasks_are_those_of_the_committed_runs() -> None:
+    compare, docs = script("foreign_tasks"), SCRIPTS.parent / "docs"
+    runs = json.loads((docs / "foreign_tasks.json").read_text())
+    assert compare.text_of(runs) in (docs / "your_task.md").read_text()
+
+
+def test_when_a_foreign_task_was_learned() -> None:
+    compare = script("foreign_tasks")
+    run = [[1000, 10.0, 0.5, 9.0], [2000, 11.0, 0.95, 5.0], [3000, 12.0, 0.8, 3.0]]
+    late = [[1000, 30.0, 0.1, None], [2000, 60.0, 0.2, 7.0]]
+    found = {"FetchReach-v4 tbc-hrl 100": run, "FetchReach-v4 tbc-hrl 101": run, "FetchReach-v4 sac 100": late}
+    table = compare.learned(found).splitlines()
+    assert table[2].split(" | ")[2:] == ["2", "2,000", "11", "3.0 |"]
+    assert table[3].split(" | ")[2:] == ["1", "never", "never", "7.0 |"]
+    assert compare.span([1000, None, 3000]) == "2,000 (1,000 to 3,000); 1 of 3 never"
+    fast = [[6000 * k, 60.0 * k, k / 10, None] for k in range(1, 11)]
+    slow = [[6000 * k, 120.0 * k, 0.0, None] for k in range(1, 6)]
+    curves = compare.curves({"FetchPush-v4 tbc-hrl 100": fast, "FetchPush-v4 sac 100": slow})
+    assert "| `FetchPush-v4`, 1,000 steps | 5 | 10 | 15 | 20 | 25 | 30 |" in curves
+    assert f"| {compare.AGENTS['tbc-hrl']} | - | 0.10 | 0.20 | 0.30 | 0.40 | 0.50 |" in curves
+    assert "| `FetchPush-v4`, CPU minutes | 1 | 2 | 4 | 6 | 8 | 10 |" in curves
+    assert f"| {compare.AGENTS['tbc-hrl']} | 0.10 | 0.20 | 0.40 | 0.60 | 0.80 | 1.00 |" in curves
+
+
+def test_a_run_ends_soon_after_it_has_learned() -> None:
+    compare = script("foreign_tasks")
+    rates = iter([0.2, 0.95, 0.7, 0.6, 0.5])
+    watch = compare.Watch(compare.Plan(5000, 1000, (0,), to_goal=True), lambda model, seed: (next(rates), None), 0.0)
+    watch.started = compare.cpu_seconds()
+    steps = 0
+    goes_on = True
+    while goes_on:
+        steps += 500
+        watch.num_timesteps = steps
+        watch.model = None
+        goes_on = watch._on_step()
+    assert [point.steps for point in watch.points] == [1000, 2000, 3000, 4000]

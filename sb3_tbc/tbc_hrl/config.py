@@ -47,7 +47,7 @@ __all__ = [
 
 WINDOW_STEPS = 10
 """Steps of an episode for each decision with ``max_options: auto``: time for the low level to do something."""
-MOST_OPTIONS = 20
+MOST_OPTIONS = 10
 """Most decisions with ``max_options: auto``, however long an episode is."""
 
 
@@ -56,7 +56,8 @@ class AgentConfig(Settings):
     """Settings of an agent of two levels that are not of one level alone."""
 
     max_options: Annotated[int, Range(1, 1_000_000)] | Literal["auto"] = 20
-    """High-level decisions allowed per episode; ``auto``: one for every ten steps of an episode, at most 20."""
+    """High-level decisions allowed per episode; ``auto``: one for every ten steps of an episode, at most 10; windows
+    with ``window_end: timed`` and the longest time budget derived then last half of it at least."""
     window_end: Literal["timed", "reached", "reconsider"] = "timed"
     """What ends a window. ``timed``: its time budget alone (HiTS). ``reached``: reaching the subgoal as well (algorithm
     1). ``reconsider``: also the high level, when its critic values a new option more than the rest of this one (arXiv
@@ -134,7 +135,7 @@ class AgentConfig(Settings):
     stops, saved. ``end-episode``: the episode ends with the step before, and the next one begins."""
 
     def for_episodes_of(self, steps: int | None) -> Self:
-        """These settings with ``max_options`` as a number.
+        """These settings with ``max_options`` as a number, and windows that do not use them up in half an episode.
 
         :param steps: time limit of the task; None where it has none
         :raises SettingError: if ``max_options`` is to be derived from a time limit that there is not
@@ -145,7 +146,9 @@ class AgentConfig(Settings):
             raise SettingError(
                 "max_options", "of 'auto' needs an environment with a time limit; say how many decisions"
             )
-        return replace(self, max_options=min(max(steps // WINDOW_STEPS, 1), MOST_OPTIONS))
+        options = min(max(steps // WINDOW_STEPS, 1), MOST_OPTIONS)
+        shortest = steps / options / 2 if self.window_end == "timed" and self.dt_max == -1 else 0.0
+        return replace(self, max_options=options, dt_min=max(self.dt_min, shortest))
 
     def check(self) -> None:
         """Refuse what cannot be meant together."""

@@ -98,7 +98,7 @@ def test_learns_saves_and_loads(tmp_path) -> None:
     assert np.array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize(("steps", "options"), [(50, 5), (300, 20), (1000, 20), (7, 1), (100, 10)])
+@pytest.mark.parametrize(("steps", "options"), [(50, 5), (300, 10), (1000, 10), (7, 1), (100, 10)])
 def test_decisions_follow_the_time_limit(steps: int, options: int) -> None:
     config = TBCConfig(max_options="auto")
     assert config.for_episodes_of(steps).max_options == options
@@ -107,9 +107,20 @@ def test_decisions_follow_the_time_limit(steps: int, options: int) -> None:
         config.for_episodes_of(None)
 
 
+def test_windows_do_not_use_up_decisions_that_follow_the_time_limit() -> None:
+    def shortest(**settings: object) -> float:
+        return TBCConfig(max_options="auto", **settings).for_episodes_of(300).dt_min  # type: ignore[arg-type]
+
+    assert shortest() == 15.0
+    assert shortest(dt_min=20.0) == 20.0
+    assert shortest(dt_max=40.0) == 0.0
+    assert shortest(window_end="reached") == 0.0
+    assert TBCConfig(max_options=10).for_episodes_of(300).dt_min == 0.0
+
+
 def test_an_agent_takes_its_decisions_from_the_task(tmp_path) -> None:
     agent = make_agent(make("Pendulum"), max_options="auto")
-    assert agent.max_options == agent.rules.max_options == 20
-    assert agent.rules.dt_max == pytest.approx(agent.episode_length / 20)
+    assert agent.max_options == agent.rules.max_options == 10
+    assert agent.rules.dt_max == pytest.approx(agent.episode_length / 10)
     agent.save(tmp_path / "agent.zip")
-    assert TBCHRL.load(tmp_path / "agent.zip").max_options == 20
+    assert TBCHRL.load(tmp_path / "agent.zip").max_options == 10
