@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -200,3 +202,84 @@ def test_stability_and_steps_to() -> None:
     assert stats.stability([0.1, 0.2]) is None
     assert stats.steps_to([5, 10, 15, 20, 25], rates, 0.95) == 15
     assert stats.steps_to([5], [0.1], 0.9) is None
+
+
+@pytest.mark.parametrize("interval", [stats.wilson_interval, stats.clopper_pearson])
+def test_rates_that_cannot_be(interval: Callable[[int, int], tuple[float, float]]) -> None:
+    for successes, trials in ((0, 0), (-1, 10), (1, 0)):
+        with pytest.raises(ValueError, match=f"got {successes} of {trials}"):
+            interval(successes, trials)
+    low, high = interval(0, 10)
+    assert low == pytest.approx(0.0)
+    assert 0.2 < high < 0.4
+    narrow = interval(5, 10, confidence=0.5)  # type: ignore[call-arg]
+    assert interval(5, 10)[0] < narrow[0] < 0.5 < narrow[1] < interval(5, 10)[1]
+
+
+def test_success_intervals_weigh_seeds_by_their_episodes() -> None:
+    rates, episodes = [1.0, 0.5], [10, 90]
+    assert stats.success_interval(rates, episodes)[1:] == pytest.approx(stats.clopper_pearson(55, 100))
+    assert stats.success_interval(rates, episodes).mean == 0.75
+    three = stats.success_interval([0.2, 0.5, 0.8], [100] * 3)
+    assert three[1:] == stats.bootstrap_mean([0.2, 0.5, 0.8])[1:] == (pytest.approx(0.2), pytest.approx(0.8))
+
+
+def test_confidence_and_resamples_are_obeyed() -> None:
+    values = np.random.default_rng(2).random(12)
+    wide, narrow = stats.bootstrap_mean(values), stats.bootstrap_mean(values, confidence=0.5)
+    assert wide.low < narrow.low < values.mean() < narrow.high < wide.high
+    half = 0.6745 * values.std() / np.sqrt(12)
+    assert (narrow.low, narrow.high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.01)
+    paired = stats.paired_block_bootstrap([values], [np.zeros(12)], confidence=0.5)
+    assert (paired.low, paired.high) == pytest.approx((narrow.low, narrow.high), abs=0.01)
+    assert len(np.unique(np.diff(stats.bootstrap_band(values[:, None], n_resamples=1)))) == 0  # one draw: no width
+    low, high = stats.bootstrap_band(values[:, None], n_resamples=1)
+    assert low == high
+    assert stats.bootstrap_mean(values, seed=1) != wide
+
+
+def test_blocks_are_consecutive_and_wrap_around() -> None:
+    values = np.array([0.0, 1.0, 10.0, 100.0, 1000.0])
+    means = stats._block_means(values, 3, 4000, np.random.default_rng(0))
+    blocks = [[values[(start + k) % 5] for k in range(3)] for start in range(5)]
+    possible = {round(sum(first + second[:2]) / 5, 6) for first in blocks for second in blocks}
+    assert {round(float(mean), 6) for mean in means} == possible
+    seeds = stats.paired_block_bootstrap([[1.0, 1.0], [3.0, 3.0]], [[0.0, 0.0], [0.0, 0.0]])
+    assert seeds == (2.0, 2.0, 2.0)
+
+
+def test_the_interval_of_the_interquartile_mean_resamples_seeds_within_tasks() -> None:
+    apart = [[0.0] * 4, [1.0] * 4]  # resampling over tasks would give an interval
+    assert stats.interquartile_mean(apart) == (0.5, 0.5, 0.5)
+    one = [np.linspace(0.0, 1.0, 40)]
+    iqm = stats.interquartile_mean(one)
+    simulated = [scipy_stats.trim_mean(np.random.default_rng(k).choice(one[0], size=40), 0.25) for k in range(2000)]
+    assert (iqm.low, iqm.high) == pytest.approx(tuple(np.percentile(simulated, [2.5, 97.5])), abs=0.02)
+    narrow = stats.interquartile_mean(one, confidence=0.5)
+    assert iqm.low < narrow.low < narrow.high < iqm.high
+
+
+def test_marks_and_what_only_one_method_has() -> None:
+    ours = {"A": [0.8, 0.9, 1.0], "only ours": [1.0] * 3, "B": [0.1, 0.5, 0.9]}
+    theirs = {"A": [0.55, 0.6, 0.65], "only theirs": [1.0] * 3, "B": [0.2, 0.5, 0.8]}
+    result = stats.compare(ours, theirs)
+    assert set(result) == {"A", "B"}
+    alone = stats.compare({"A": ours["A"]}, theirs)["A"]
+    assert alone.p_value is not None
+    assert 0.01 < alone.p_value < 0.05
+    assert alone.mark == "*"
+    assert result["A"].p_holm == pytest.approx(2 * alone.p_value)
+    assert result["A"].mark == ("*" if 2 * alone.p_value < 0.05 else "")
+    assert alone.note == ""
+
+
+def test_values_on_the_threshold_count() -> None:
+    assert stats.stability([0.9, 0.5], 0.9) == (0.5, 0.5)
+    assert stats.stability([0.5, 0.7], 0.7) == (1.0, 0.7)
+    assert stats.steps_to([5, 10], [0.89, 0.9], 0.9) == 10
+    with pytest.raises(ValueError, match="zip"):
+        stats.steps_to([5], [0.1, 0.2], 0.9)
+    with pytest.raises(ValueError, match="at least one value"):
+        stats.spread([])
+    with pytest.raises(ValueError, match="got 0 and 1"):
+        stats.cliffs_delta([], [1.0])
