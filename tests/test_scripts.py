@@ -164,3 +164,17 @@ def test_a_run_ends_soon_after_it_has_learned() -> None:
         watch.model = None
         goes_on = watch._on_step()
     assert [point.steps for point in watch.points] == [1000, 2000, 3000, 4000]
+
+
+def test_a_stopwatch_counts_what_comes_after_the_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    speeds = script("speeds")
+    now = 0.0
+    monkeypatch.setattr(speeds.time, "process_time", lambda: now)
+    watch = speeds.Stopwatch(after=100, seconds=5.0)
+    going = []
+    for steps in range(50, 401, 50):
+        watch.num_timesteps = steps
+        going.append(watch._on_step())
+        now += 30.0 if steps < 100 else 1.0  # compilation does not count
+    assert going == [True] * 6 + [False] * 2
+    assert watch.speed == pytest.approx(300 / 7)
