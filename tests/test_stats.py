@@ -236,6 +236,8 @@ def test_confidence_and_resamples_are_obeyed() -> None:
     low, high = stats.bootstrap_band(values[:, None], n_resamples=1)
     assert low == high
     assert stats.bootstrap_mean(values, seed=1) != wide
+    median = stats.bootstrap_mean(values, confidence=0.0)
+    assert median.low == median.high
 
 
 def test_blocks_are_consecutive_and_wrap_around() -> None:

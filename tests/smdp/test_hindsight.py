@@ -24,6 +24,7 @@ from sb3_tbc.smdp.hindsight import (
 )
 from sb3_tbc.smdp.options import Episode, Option, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
+from sb3_tbc.smdp.spaces import SubgoalSpace
 from sb3_tbc.smdp.views import LevelViews
 
 ENV = Corridor()
@@ -422,3 +423,70 @@ def test_burn_in_sees_the_sampled_subgoal_and_its_time() -> None:
     assert (states[~later] == 0).all()
     with pytest.raises(ValueError, match="recomputes the low level's memory"):
         SubgoalReplayBuffer(9, LAYOUT.low_space(), ENV.action_space, LAYOUT, RULES, 0, 0.9, 1, sequence_length=2)
+
+
+def test_goals_of_an_event() -> None:
+    """The flag, the third entry of the observation, is set when the first option ends."""
+    own = ENV.subgoals
+    with pytest.raises(ValueError, match="names none"):
+        check_goal_strategy("event", own)
+    with pytest.raises(ValueError, match="names none"):
+        check_goal_strategy("event", None)
+    maps = own.achieved, own.local
+    subgoals = SubgoalSpace([-1.0], [1.0], [0.05], *maps, [1.0, 50.0, 100.0], ["position"], event=2)
+    check_goal_strategy("event", subgoals)
+    options = np.arange(2)
+    np.testing.assert_array_equal(
+        goal_pairs(2, 3, "event", np.random.default_rng(0), 0), np.stack([options, [0, 0]], 1)
+    )
+    assert goal_pairs(2, 3, "event", np.random.default_rng(0)).shape == (0, 2)
+    assert np.issubdtype(goal_pairs(2, 3, "event", np.random.default_rng(0)).dtype, np.integer)
+    flags = episode().observation.copy()
+    flags[:, 2] = [0, 0, 0, 1, 0, 0]
+    reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0)
+    settings = HindsightSettings(3, "event", -5.0, keep_original=False)
+
+    def steps(of: Episode) -> HighLevelSteps:
+        return high_level_steps(of, subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
+
+    happened = steps(episode()._replace(observation=flags))
+    np.testing.assert_allclose(happened.observations[-2:, 0], 0.3)  # both get the goal that the first option met
+    np.testing.assert_array_equal(happened.dones[-2:], [True, False])
+    flags[:, 2] = 0
+    assert len(steps(episode()._replace(observation=flags)).rewards) == len(happened.rewards) - 2
+
+
+def test_decisions_meet_hindsight_goals_at_their_end() -> None:
+    """With a reward per decision a goal that the window only passes is not met, whatever ``goals_met`` says."""
+    there_and_on = np.array([0.0, 0.2, 0.5, 0.3, 0.4, 0.2])
+    rows = np.stack([there_and_on, np.arange(6.0), np.ones(6)], axis=1).astype(np.float32)
+    wandering = episode()._replace(observation=rows, achieved_goal=there_and_on[:, None], desired_goal=np.ones((6, 1)))
+    reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0)
+    settings = HindsightSettings(1, "future", -5.0, keep_original=False, goals_met="passing")
+    rng = np.random.default_rng(0)
+    steps = high_level_steps(wandering, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, rng)
+    assert not steps.dones[-1]
+    assert steps.durations[-1] == 3
+
+
+def test_copies_with_hindsight_goals_have_the_bonus_and_keep_their_types() -> None:
+    reward = HighLevelReward(
+        "smdp", 1.0, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0, completion_bonus=0.25
+    )
+    settings = HindsightSettings(1, "future", -5.0, keep_original=False)
+    rng = np.random.default_rng(0)
+    steps = high_level_steps(episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, rng)
+    assert steps.rewards[-1] == pytest.approx(-3 / 2 - 1 + 0.25)  # three steps to 0.3, on the way to 0.5
+    assert steps.dones.dtype == bool
+    assert np.issubdtype(steps.durations.dtype, np.integer)
+    goals = relabel_goals(episode(), np.array([0]), np.array([3]), np.array([[0.2]]), reward, GOALS, at_end=False)
+    assert np.issubdtype(goals.durations.dtype, np.integer)
+
+
+def test_the_tolerance_of_hindsight_is_the_one_given() -> None:
+    moved = episode()
+    moved.achieved_goal[3] = 1.2
+    for tolerance, relabelled in ((0.3, True), (0.1, False)):
+        actions, changed = relabel_actions(moved, ENV.subgoals, RULES, np.random.default_rng(0), tolerance)
+        np.testing.assert_array_equal(changed, [relabelled, False])
+        assert actions[0, 0] == pytest.approx(1.0 if relabelled else 0.9)
