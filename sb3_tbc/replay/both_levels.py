@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 from sb3_tbc.arrays import AnyArray, Arrays
 from sb3_tbc.files import write_arrays
@@ -16,11 +16,21 @@ MORE = "running"
 """Prefix of arrays in the file that belong to neither buffer."""
 
 
-class Replay(NamedTuple):
-    """The replay buffers of both levels."""
-
+class _BothLevels(NamedTuple):
     high: OptionReplayBuffer
     low: SubgoalReplayBuffer
+
+
+class Replay(_BothLevels):
+    """The replay buffers of both levels."""
+
+    __slots__ = ()
+
+    def __getattr__(self, name: str) -> NoReturn:
+        """Say where to look: agents of SB3 have one buffer."""
+        raise AttributeError(
+            f"{name!r} belongs to a replay buffer, and there are two: replay_buffer.high and replay_buffer.low"
+        )
 
     def save(self, path: str | pathlib.Path | io.BufferedIOBase, more: Mapping[str, AnyArray]) -> None:
         """Write both buffers to one file of plain arrays, atomically.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NoReturn
+
 import numpy as np
 
 from sb3_tbc.arrays import BoolArray, FloatArray
@@ -25,6 +27,13 @@ class TwoLevelActor:
         self, high: SACLevel, low: SACLevel, memory: str, reconsideration: Reconsideration | None = None
     ) -> None:
         self.high, self.low, self.memory, self.reconsideration = high, low, memory, reconsideration
+
+    def predict(self, *_: object, **__: object) -> NoReturn:
+        """Refused: an action takes the clock of the running option, which the policy keeps.
+
+        :raises TypeError: always, naming what to call
+        """
+        raise TypeError("both levels act through the policy, which keeps the option's clock: use policy.predict")
 
     def notice_changes(self) -> None:
         """Act from weights that were changed by hand, too."""

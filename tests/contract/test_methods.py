@@ -162,6 +162,21 @@ def test_other_settings_are_not_taken_in_silence(algo: str, name: str) -> None:
         setattr(model, name, 3)
 
 
+@shows("refused", "replay_buffer.<attribute of SB3's buffer>")
+@two_levels
+@pytest.mark.parametrize("name", ["device", "pos", "size"])
+def test_what_one_buffer_has_is_told_of_two(algo: str, name: str) -> None:
+    with pytest.raises(AttributeError, match=r"there are two: replay_buffer\.high and"):
+        getattr(make(algo).replay_buffer, name)
+
+
+@shows("refused", "policy.actor.predict")
+@two_levels
+def test_both_levels_act_through_the_policy(algo: str) -> None:
+    with pytest.raises(TypeError, match=r"use policy\.predict"):
+        make(algo).policy.actor.predict({})
+
+
 @shows("refused", "load(<unknown>=)")
 @every_algorithm
 def test_loading_takes_nothing_that_it_does_not_know(algo: str, tmp_path: Path) -> None:
