@@ -103,7 +103,7 @@ def _job(args: argparse.Namespace, algo: str, env: str, seed: int, ablation: str
 
 
 def evaluated_episodes(args: argparse.Namespace, n_timesteps: int) -> int:
-    """Episodes of all evaluations of a run of so many steps."""
+    """Episodes of all evaluations of a run of ``n_timesteps``."""
     along = n_timesteps // (args.eval_freq or default_eval_freq(n_timesteps))
     return int(along * (args.n_eval_episodes or N_EVAL_EPISODES) + args.n_final_episodes)
 
