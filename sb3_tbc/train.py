@@ -147,7 +147,7 @@ def config_and_file(args: argparse.Namespace) -> tuple[str | None, Path | None]:
 
 
 def default_eval_freq(n_timesteps: int) -> int:
-    """Environment steps between two evaluations of a run of so many steps."""
+    """Environment steps between two evaluations of a run of ``n_timesteps``."""
     return max(n_timesteps // 40, 500)
 
 
