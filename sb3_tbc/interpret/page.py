@@ -28,6 +28,8 @@ SIMULATED: dict[str, tuple[Plain, ...]] = {
     "Drawbridge": ({"observation": "compact"},),
 }
 """Tasks that the page can simulate, each with the arguments of the variants that it simulates."""
+MOST_BYTES = 2_900_000
+"""Most bytes of a page; episodes get what the rest leaves."""
 STEPS_PER_SECOND = {"Pendulum": 50, "Drawbridge": 100, "AntFourRooms": 10, "UR5Reacher": 33}
 N_STARTS = 5
 
@@ -45,7 +47,7 @@ def live_page(
     :param picture: activation in space, PNG
     :raises ConfigError: if the agent cannot be put into numbers, saying why
     """
-    data = page_data(model, found, space, episodes, info)
+    data = page_data(model, found, space, info)
     circuit = found.kind == "circuit"
     parts = {
         "title": html.escape(f"Inside a {info['algo']} agent: {found.task}"),
@@ -60,20 +62,43 @@ def live_page(
         "picture": base64.b64encode(picture).decode(),
         "style": _asset("style.css"),
         "script": "\n".join(_asset(f"{name}.js") for name in SCRIPTS),
-        "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
     }
     page = _asset("page.html")
     for name, text in parts.items():
         page = page.replace(f"@@{name}@@", text)
-    return page
+    room = MOST_BYTES - len(page.encode()) - len(_json(data))
+    starts = _starts(model, found, space, episodes, bool(data["live"]), room)
+    return page.replace("@@data@@", _json(data | {"starts": starts}))
 
 
-def page_data(model: TBCHRL, found: Findings, space: TaskSpace, episodes: HeldOutEpisodes, info: PlainMapping) -> Plain:
-    """All numbers of the page."""
+def _json(data: Plain) -> str:
+    return json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def _starts(
+    model: TBCHRL, found: Findings, space: TaskSpace, episodes: HeldOutEpisodes, live: bool, room: int
+) -> list[Plain]:
+    if live:
+        return live_starts(episodes, found.traces)
+    return recorded_starts(model, found.units, episodes, found.traces, space, _order(found), _means(found), room)
+
+
+def _order(found: Findings) -> list[int]:
+    """Units, the most active first."""
+    order: list[int] = np.argsort(-found.activity).tolist()
+    return order
+
+
+def _means(found: Findings) -> FloatArray:
+    """Mean activation of each unit, ``(N,)``."""
+    means: FloatArray = np.concatenate([t.activations for t in found.traces]).mean(axis=0).astype(np.float64)
+    return means
+
+
+def page_data(model: TBCHRL, found: Findings, space: TaskSpace, info: PlainMapping) -> Plain:
+    """All numbers of the page but those of its episodes."""
     policy, units = extract(model, found.task), found.units
     live = found.task if dict(info["env_kwargs"]) in SIMULATED.get(found.task, ()) else None
-    means = np.concatenate([t.activations for t in found.traces]).mean(axis=0).astype(np.float64)
-    order = np.argsort(-found.activity).tolist()
     alone = [r for r in found.lesions if r.what == "alone"]
     return {
         "live": live,
@@ -87,17 +112,14 @@ def page_data(model: TBCHRL, found: Findings, space: TaskSpace, episodes: HeldOu
         "readout": _plain(_readout(policy, len(units.names))),
         "subgoal_names": list(model.views.subgoals.names),
         "rest": _plain(units.rest),
-        "mean": _plain(means),
+        "mean": _plain(_means(found)),
         "recorded_form": "mean",
-        "most_active": order[0],
+        "most_active": _order(found)[0],
         "n_episodes": len(found.traces),
         "alone": [{"unit": r.units[0], "clamped_to": r.clamped_to, "success_rate": r.success_rate} for r in alone],
         "steps_per_second": STEPS_PER_SECOND.get(found.task, 60),
         "space_labels": list(space.labels),
         "space_bounds": _bounds(found.traces, space, model),
-        "starts": live_starts(episodes, found.traces)
-        if live
-        else recorded_starts(model, units, episodes, found.traces, space, order, means),
     }
 
 

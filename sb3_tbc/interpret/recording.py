@@ -28,23 +28,22 @@ class FilmSize(NamedTuple):
 
 
 WHOLE, LESIONED = FilmSize(60, 320, 70), FilmSize(24, 200, 50)
-MOST_BYTES = 2_200_000
-"""Most bytes of all episodes of a page together; the page then stays below three million bytes."""
 
 
 def recorded_starts(
     model: TBCHRL, units: Units, episodes: HeldOutEpisodes, traces: Sequence[Trace], space: TaskSpace,
-    order: Sequence[int], means: FloatArray,
+    order: Sequence[int], means: FloatArray, room: int,
 ) -> list[Plain]:  # fmt: skip
     """The page's episodes: the first with lesions, as many as there is room for, and the second whole.
 
     :param order: units, those that are to be lesioned first at the beginning
     :param means: what a lesioned unit is clamped to, ``(N,)``
+    :param room: most bytes of all episodes together
     """
     env = episodes.make_env()
     whole = [_episode(model, env, traces[k], space, episodes.seed + k, WHOLE) for k in range(min(2, len(traces)))]
     starts = [_start(k, trace, space, model, one) for k, (trace, one) in enumerate(zip(traces, whole, strict=False))]
-    room = MOST_BYTES - sum(_size(one) for one in whole)
+    room -= sum(_size(one) for one in whole)
     for unit in order:
         (trace,) = episodes.record_one(units, clamp(units, [unit], means))
         one = _episode(model, env, trace, space, episodes.seed, LESIONED)
