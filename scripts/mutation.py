@@ -27,7 +27,7 @@ SUBJECTS = {
         ["tests/report/test_tables.py"],
     ),
     "hindsight": (["sb3_tbc/smdp/hindsight.py"], ["tests/smdp/test_hindsight.py"]),
-    "buffers": (["sb3_tbc/replay/buffers.py"], ["tests/smdp/test_hindsight.py"]),
+    "buffers": (["sb3_tbc/replay/buffers.py"], ["tests/replay/test_buffers.py"]),
     "evaluation": (["sb3_tbc/tbc_hrl/evaluation.py"], ["tests/tbc_hrl/test_evaluation.py"]),
 }  # fmt: skip
 """Name -> modules that are changed, and the tests that ought to notice."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from scipy.stats import spearmanr
-from test_hindsight import LAYOUT, low_buffer
+from two_windows import LAYOUT, low_buffer
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.smdp.hindsight import low_level_steps
