@@ -230,8 +230,10 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
 
     def reset(self) -> VecEnvObs:
         """Begin an episode everywhere."""
-        there = isinstance(self.venv, SubprocVecEnv)
-        observation = reset_checked(self.venv, self._shapes) if there else self.venv.reset()  # type: ignore[arg-type]
+        if isinstance(self.venv, SubprocVecEnv):
+            observation = reset_checked(self.venv, self._shapes)
+        else:
+            observation = self.venv.reset()
         for index in range(self.num_envs):
             self._begin(index)
         return observation

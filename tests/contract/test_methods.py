@@ -296,12 +296,13 @@ def test_the_policy_does_what_sb3s_does(algo: str) -> None:
 @shows("yes", "policy.parameters changed in place")
 @two_levels
 @pytest.mark.parametrize("how", ["no_grad", "data"])
-def test_weights_changed_by_hand_act(algo: str, how: str) -> None:
+@pytest.mark.parametrize("factor", [1.5, -1.0])
+def test_weights_changed_by_hand_act(algo: str, how: str, factor: float) -> None:
     model = make(algo)
     before = act(model)
     for parameter in model.policy.parameters():
         with th.no_grad():
-            (parameter.data if how == "data" else parameter).mul_(1.5)
+            (parameter.data if how == "data" else parameter).mul_(factor)
     assert not np.array_equal(act(model), before)
     model.learn(60)
 
