@@ -29,6 +29,9 @@ Values = Plain
 SCHEDULE = "learning_rate_schedule"
 """Parameter without a setting of its own: with ``linear`` the searched learning rates fall to zero."""
 SCHEDULES = ("constant", "linear")
+RATES = ("low.learning_rate", "low.actor_learning_rate", "high.learning_rate")
+FALLBACK = {"low.actor_learning_rate": "low.learning_rate"}
+"""What holds where a setting is not set: an actor without a learning rate of its own has its critics'."""
 FIELDS = ("low", "high", "log", "step", "choices", "keys", "when")
 CIRCUIT = "low.policy_kwargs.ndbc"
 
@@ -114,6 +117,7 @@ Space = tuple[Parameter, ...]
 
 def _same(value: object, wanted: object) -> bool:
     """Whether two values are equal; ``auto_0.4`` (automatic from a start value) counts as ``auto``."""
+    value, wanted = (list(x) if isinstance(x, tuple) else x for x in (value, wanted))
     return bool(value == wanted) or (wanted == "auto" and str(value).startswith("auto"))
 
 
@@ -131,7 +135,9 @@ def read_key(run: RunConfig, key: str) -> object:
         value = value.get(name) if isinstance(value, Mapping) else None
     if value is None and len(rest) == 1 and first in ("low", "high"):
         value = run.model.get(rest[0])  # of the agent
-    return _default(run.algo, key) if value is None and not _is_set(run.model, key) else value
+    if value is not None or _is_set(run.model, key):
+        return value
+    return read_key(run, FALLBACK[key]) if key in FALLBACK else _default(run.algo, key)
 
 
 def _default(algo: str, key: str) -> object:
@@ -363,7 +369,7 @@ def apply(space: Space, values: PlainMapping, run: RunConfig) -> RunConfig:
         if parameter.name in values and parameter.name != SCHEDULE:
             settings.update(parameter.settings(values[parameter.name]))
     if SCHEDULE in values:
-        for key in ("low.learning_rate", "high.learning_rate"):
+        for key in RATES:
             rate = _plain(settings.get(key, read_key(run, key)))
             settings[key] = f"lin_{rate!r}" if values[SCHEDULE] == "linear" else rate
     change = validate(nested(settings), run.algo, "trial")
