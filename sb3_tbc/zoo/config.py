@@ -54,6 +54,7 @@ ABLATIONS: dict[str, Plain] = {
 ``no-ts`` takes timed scheduling out: windows of a constant length (``dt_max``), no remaining time for the low level to
 see, one discount per decision in place of ``gamma ** tau``. ``no-ndbc`` gives the low level an MLP. The others put one
 of :data:`PARTS` in or leave it out. All keep the full model's number of parameters, see :mod:`sb3_tbc.zoo.ablations`.
+A ``tuned`` section may hold a section of an ablation's name: what a search of its own found for it.
 """
 
 
@@ -129,12 +130,14 @@ def read_file(path: Path, algo: str | None = None) -> dict[str, Plain]:
     return {name: _checked(coerce(section), algo, f"{path.name}, section {name}") for name, section in data.items()}
 
 
-def _checked(section: Plain, algo: str | None, where: str) -> Plain:
-    """Check a section and the ``tuned`` section inside it."""
-    plain = {key: value for key, value in section.items() if key != "tuned"}
-    tuned = section.get("tuned")
-    checked = validate(plain, algo, where)
-    return checked if tuned is None else {**checked, "tuned": validate(tuned, algo, f"{where}, tuned")}
+def _checked(section: Plain, algo: str | None, where: str, inner: Sequence[str] = ("tuned",)) -> Plain:
+    """Check a section and those inside it: ``tuned``, and in there those of ablations."""
+    if not isinstance(section, dict):
+        raise ConfigError(f"{where} must be a section of keys, got {one_line(repr(section))}")
+    within = {name: section[name] or {} for name in inner if name in section}
+    checked = validate({key: value for key, value in section.items() if key not in within}, algo, where)
+    ablations = tuple(ABLATIONS) if "tuned" in inner else ()
+    return {**checked, **{name: _checked(part, algo, f"{where}, {name}", ablations) for name, part in within.items()}}
 
 
 def parse_overrides(items: Sequence[str]) -> Plain:
@@ -182,6 +185,7 @@ def load_config(
     sections = read_file(path, algo)
     default, section = dict(sections.get("default", {})), dict(sections.get(task, sections.get(OTHER, {})))
     tuned = merge(default.pop("tuned", {}), section.pop("tuned", {}))
+    own = {name: tuned.pop(name) for name in ABLATIONS if name in tuned}
     config = config or ("tuned" if tuned else "paper")
     if config not in CONFIGS:
         raise ConfigError(f"configuration must be one of {', '.join(CONFIGS)}, got {config!r}")
@@ -191,7 +195,10 @@ def load_config(
         raise ConfigError(f"only tbc-hrl has ablations, not {algo!r}")
     merged = merge(default, section)
     given = validate(overrides or {}, algo, f"--hyperparams for {algo}")
-    for change in (tuned if config == "tuned" else {}, ABLATIONS.get(ablation or "", {}), given):
+    changes = [ABLATIONS.get(ablation or "", {}), given]
+    if config == "tuned":
+        changes = [tuned, changes[0], own.get(ablation or "", {}), given]
+    for change in changes:
         merged = merge(merged, change)
     subgoals = merged.pop("subgoals", None)
     if subgoals:  # belongs to the environment, and stays with it in a saved agent

@@ -249,6 +249,26 @@ def test_other_environments_have_a_section_of_their_own(algo: str) -> None:
     assert all(isinstance(load_config(algo, task).model["max_options"], int) for task in TASKS)
 
 
+def test_an_ablation_may_have_settings_of_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "x.yml"
+    path.write_text(
+        "default: {n_timesteps: 10}\n"
+        "T: {low: {tau: 0.1}, tuned: {low: {learning_rate: 0.2}, no-ndbc: {low: {learning_rate: 0.3, tau: 0.5}}}}\n"
+    )
+
+    def low(config: str, ablation: str | None = None, *given: str) -> dict[str, Any]:
+        low: dict[str, Any] = load_config("tbc-hrl", "T", config, parse_overrides(given), ablation, path).model["low"]
+        return {name: low.get(name) for name in ("learning_rate", "tau")}
+
+    assert low("tuned") == low("tuned", "no-rule") == {"learning_rate": 0.2, "tau": 0.1}
+    assert low("tuned", "no-ndbc") == {"learning_rate": 0.3, "tau": 0.5}
+    assert low("tuned", "no-ndbc", "low.tau:0.9") == {"learning_rate": 0.3, "tau": 0.9}
+    assert low("paper", "no-ndbc") == {"learning_rate": None, "tau": 0.1}
+    path.write_text("T: {n_timesteps: 10, tuned: {no-ndbc: {low: {learning_rat: 0.3}}}}\n")
+    with pytest.raises(ConfigError, match="section T, tuned, no-ndbc: unknown setting 'low.learning_rat'"):
+        load_config("tbc-hrl", "T", path=path)
+
+
 def test_what_is_tuned_for_other_environments_stays_with_them() -> None:
     tuned, paper = (load_config("tbc-hrl", "FetchReach-v4", config).model for config in ("tuned", "paper"))
     assert tuned["relative_subgoals"]
