@@ -17,7 +17,7 @@ from torch import nn
 
 from sb3_tbc.aliases import Env, Plain, PlainMapping
 from sb3_tbc.benchmark.circuits import WIRING_NUMBERS
-from sb3_tbc.level.policies import NDBCActor
+from sb3_tbc.level.actors import NDBCActor
 from sb3_tbc.ndbc.closed_form import ClosedFormNDBC
 from sb3_tbc.ndbc.frozen import FrozenNDBC
 from sb3_tbc.ndbc.network import NDBCNet

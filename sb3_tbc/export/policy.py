@@ -16,7 +16,8 @@ from torch import nn
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.level.policies import MLPActor, NDBCActor
+from sb3_tbc.level.actors import GRUActor, MemoryActor, NDBCActor
+from sb3_tbc.level.policies import LevelActor
 from sb3_tbc.ndbc.dissipative import DissipativeCell
 from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.tbc_hrl import TBCHRL
@@ -183,12 +184,16 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     needed = rules.window_end == "reached" or layout.relative_subgoals
     if subgoals.rotations and rules.window_end == "reached":
         raise ConfigError("window_end='reached' with subgoals that are compared by angle cannot be exported")
-    high: MLPActor | NDBCActor | _MLPActor = model.high.policy.average_actor
+    high: LevelActor | _MLPActor = model.high.policy.average_actor
     low = model.low.policy.average_actor
     if model.foreign_high is not None:
         high = _foreign_actor(model.foreign_high)
-    if isinstance(high, NDBCActor):
-        raise ConfigError("only the low level can be a circuit")
+    if isinstance(high, MemoryActor):
+        raise ConfigError("only the low level can have a memory")
+    if isinstance(low, GRUActor):
+        raise ConfigError(
+            "a low level with a GRU cannot be exported; train a circuit (low.policy_kwargs.ndbc) or an MLP"
+        )
     actions = action_box(model)
     return ExportedPolicy(
         task=task,
@@ -235,7 +240,7 @@ def action_box(model: TBCHRL) -> spaces.Box:
     return space
 
 
-def _actions(actor: MLPActor | NDBCActor) -> int:
+def _actions(actor: LevelActor) -> int:
     return int(np.prod(actor.action_space.shape))
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_tbc.arrays import FloatArray
-from sb3_tbc.level.policies import GaussianHead, MLPActor, NDBCActor
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.level.actors import GaussianHead, MLPActor, NDBCActor
 from sb3_tbc.ndbc.dissipative import DissipativeCell
 from sb3_tbc.ndbc.network import NDBCNet
 from sb3_tbc.ndbc.wiring import LAYERS
@@ -56,9 +57,14 @@ def units_of(model: TBCHRL) -> Units:
     """The units of an agent's deployed (averaged) low level.
 
     :param model: a trained agent
+    :raises ConfigError: for an agent whose low level is a GRU
     """
     actor = model.low.policy.average_actor
-    return CircuitUnits(actor) if isinstance(actor, NDBCActor) else MLPUnits(actor)
+    if isinstance(actor, NDBCActor):
+        return CircuitUnits(actor)
+    if not isinstance(actor, MLPActor):
+        raise ConfigError("only circuits and MLPs can be interpreted; this agent's low level is a GRU")
+    return MLPUnits(actor)
 
 
 class CircuitUnits:

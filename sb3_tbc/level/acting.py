@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from sb3_tbc.arrays import FloatArray, FloatType
-from sb3_tbc.level.policies import GaussianHead, LevelPolicy, MLPActor, NDBCActor
+from sb3_tbc.level.actors import GaussianHead, GRUActor, GRUNet, MLPActor, NDBCActor
+from sb3_tbc.level.policies import LevelActor, LevelPolicy
 from sb3_tbc.level.storage import Block
 
 
@@ -82,6 +83,36 @@ class FrozenMLP:
         return outputs.astype(np.float32, copy=False), states
 
 
+class FrozenGRU:
+    """NumPy forward pass of a GRU actor, in double precision inside.
+
+    :param net: the network
+    """
+
+    def __init__(self, net: GRUNet) -> None:
+        self._net = net
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Copy the weights."""
+        cell, readout = self._net.cell, self._net.readout
+        names = (cell.weight_ih, cell.bias_ih, cell.weight_hh, cell.bias_hh, readout.weight, readout.bias)
+        self._arrays = [tensor.detach().numpy().astype(np.float64).T for tensor in names]
+        self._gain = self._net.input_gain.numpy().astype(np.float64)
+
+    def __call__(self, inputs: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Outputs ``(n, 2 * action_dim)`` before the head's bounds, and the next states ``(n, hidden_size)``."""
+        seen, seen_bias, kept, kept_bias, readout, bias = self._arrays
+        # r, z = sigmoid(...), n = tanh(W x + r * (U h)), h' = (1 - z) n + z h (Cho et al. 2014, as torch has it)
+        new, old = (inputs * self._gain) @ seen + seen_bias, state @ kept + kept_bias
+        width = state.shape[1]
+        gates = 0.5 + 0.5 * np.tanh(0.5 * (new[:, : 2 * width] + old[:, : 2 * width]))
+        forget, keep = gates[:, :width], gates[:, width:]
+        candidate = np.tanh(new[:, 2 * width :] + forget * old[:, 2 * width :])
+        state = candidate + keep * (state - candidate)
+        return (state @ readout + bias).astype(np.float32), state.astype(np.float32)
+
+
 def _as_array(block: Block) -> FloatArray:
     """A block of at most two dimensions as one array, without a copy if its parameters lie in flat storage."""
     flat = _in_one_piece(block.parameters)
@@ -101,15 +132,20 @@ def _in_one_piece(parameters: Sequence[th.Tensor]) -> FloatArray | None:
     return first.as_strided(((end - first.data_ptr()) // first.element_size(),), (1,)).numpy()
 
 
-def freeze(actor: MLPActor | NDBCActor, dtype: FloatType = np.float32) -> FrozenNet:
+def freeze(actor: LevelActor, dtype: FloatType = np.float32) -> FrozenNet:
     """NumPy forward pass of an actor whose parameters lie in flat storage.
 
-    :param dtype: precision of an MLP's arithmetic; a circuit's is double in any case
+    :param dtype: precision of an MLP's arithmetic; with a memory it is double in any case
+    :raises TypeError: for another kind of actor
     """
     if isinstance(actor, NDBCActor):
         from sb3_tbc.ndbc.frozen import FrozenNDBC
 
         return FrozenNDBC(actor.net)
+    if isinstance(actor, GRUActor):
+        return FrozenGRU(actor.net)
+    if not isinstance(actor, MLPActor):
+        raise TypeError(f"no NumPy forward pass for an actor of type {type(actor).__name__}")
     return FrozenMLP(actor, dtype)
 
 

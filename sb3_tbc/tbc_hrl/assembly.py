@@ -175,6 +175,8 @@ def make_low_level(
             circuit["motor"] = ends.action.shape[0]
         if circuit["input_scale"] is None:
             circuit["input_scale"] = views.low_scale().tolist()
+    if policy_kwargs["gru"] is not None:
+        policy_kwargs["gru"] = {"hidden_size": policy_kwargs["gru"], "input_scale": views.low_scale().tolist()}
     if policy_kwargs["negative_critic"] is None:
         policy_kwargs["negative_critic"] = config.low_reward == "step"
     return _make_level("low", config, config.low, ends, policy_kwargs, seed, device, bounds)

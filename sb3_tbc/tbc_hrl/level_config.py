@@ -165,6 +165,20 @@ class LowPolicyConfig(PolicyConfig):
 
     ndbc: CircuitConfig | None = CircuitConfig()
     """The circuit that acts; null: an MLP acts in its place."""
+    gru: Annotated[int, Range(1, 4096)] | None = None
+    """Width of a gated recurrent unit that acts where ``ndbc`` is null, a control for the circuit's memory; null: none.
+    It can be neither exported nor interpreted."""
+    critic_memory: bool = False
+    """Whether critics see the actor's memory beside the observation. For tasks whose observations hide something; needs
+    an actor with a memory."""
+
+    def check(self) -> None:
+        """Refuse what cannot be meant together."""
+        super().check()
+        if self.gru is not None and self.ndbc is not None:
+            raise SettingError("gru", f"of {self.gru} needs ndbc: null, as one network acts, not two")
+        if self.critic_memory and self.ndbc is None and self.gru is None:
+            raise SettingError("critic_memory", "needs an actor with a memory: a circuit (ndbc) or a gru")
 
 
 @dataclass(frozen=True, kw_only=True)

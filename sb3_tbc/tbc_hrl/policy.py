@@ -13,8 +13,9 @@ from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 
 from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray
 from sb3_tbc.errors import NonFiniteError
+from sb3_tbc.level.actors import NDBCActor
 from sb3_tbc.level.level import SACLevel
-from sb3_tbc.level.policies import LevelPolicy, NDBCActor
+from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.ndbc.diagnostics import check_finite
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions
 from sb3_tbc.smdp.hierarchical_vec_env import Schedule

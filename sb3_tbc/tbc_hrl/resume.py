@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import AnyArray, Arrays
+from sb3_tbc.level.actors import NDBCActor
 from sb3_tbc.level.level import SACLevel
-from sb3_tbc.level.policies import NDBCActor
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv, RunningEpisode
 from sb3_tbc.tbc_hrl.collection import Collector

@@ -14,7 +14,7 @@ from sb3_tbc.interpret.episodes import FIRST_SEED, HeldOutEpisodes, Trace, outco
 from sb3_tbc.interpret.lesions import activity, plan_lesions, relative_drop, run_lesions
 from sb3_tbc.interpret.time_constants import memory_share, time_constants
 from sb3_tbc.interpret.units import CircuitUnits, MLPUnits, clamp, no_lesion, units_of
-from sb3_tbc.level.policies import NDBCActor
+from sb3_tbc.level.actors import NDBCActor
 from sb3_tbc.tbc_hrl.evaluation import evaluate_hierarchical
 from sb3_tbc.zoo.environments import make_envs
 

@@ -20,7 +20,8 @@ OBSERVATIONS = spaces.Box(-np.inf, np.inf, (6,), np.float32)
 ACTIONS = spaces.Box(-1.0, 1.0, (3,), np.float32)
 NDBC = {"inter": 6, "command": 5, "motor": 3, "sensory_fanout": 3, "inter_fanout": 3,
         "recurrent_command_synapses": 4, "motor_fanin": 3, "sub_steps": 2}  # fmt: skip
-ACTORS = pytest.mark.parametrize("ndbc", [None, NDBC], ids=["mlp", "ndbc"])
+GRU = {"hidden_size": 5, "input_scale": [2.0] * 6}
+ACTORS = pytest.mark.parametrize("actor", [{}, {"ndbc": NDBC}, {"gru": GRU}], ids=["mlp", "ndbc", "gru"])
 
 
 class RandomBuffer:
@@ -37,8 +38,8 @@ class RandomBuffer:
         return LevelBatch(draw(6), th.tanh(draw(3)), draw(6), draw(1), dones, discounts, *states)
 
 
-def make_level(ndbc: dict | None = None, **kwargs: object) -> SACLevel:
-    policy_kwargs = {"net_arch": [8, 7], "ndbc": ndbc, "mean_bound": 3.0, **kwargs.pop("policy_kwargs", {})}
+def make_level(actor: dict | None = None, **kwargs: object) -> SACLevel:
+    policy_kwargs = {"net_arch": [8, 7], "mean_bound": 3.0, **(actor or {}), **kwargs.pop("policy_kwargs", {})}
     arguments = {"seed": 1, "compile": False, "learning_rate": 1e-2, "name": "low", **kwargs}
     level = SACLevel("MlpPolicy", OBSERVATIONS, ACTIONS, None, policy_kwargs=policy_kwargs, **arguments)
     level.replay_buffer = RandomBuffer(level.state_dim)
@@ -53,14 +54,14 @@ def inputs(level: SACLevel, n: int = 4) -> tuple[np.ndarray, np.ndarray]:
 
 @ACTORS
 @pytest.mark.parametrize("average", [False, True])
-def test_act_is_the_actor(ndbc: dict | None, average: bool) -> None:
-    level = make_level(ndbc)
+def test_act_is_the_actor(actor: dict, average: bool) -> None:
+    level = make_level(actor)
     obs, states = inputs(level)
     for _ in range(2):
         level.train(3, 16)
         actions, next_states = level.act(obs, states, True, np.random.default_rng(0), average)
-        actor = level.policy.average_actor if average else level.actor
-        mean, _, expected = actor.step(th.from_numpy(obs), th.from_numpy(states))
+        torch_actor = level.policy.average_actor if average else level.actor
+        mean, _, expected = torch_actor.step(th.from_numpy(obs), th.from_numpy(states))
         assert np.allclose(actions, mean.tanh().detach().numpy(), atol=1e-6)
         assert np.allclose(next_states, expected.detach().numpy(), atol=1e-6)
         assert actions.dtype == next_states.dtype == np.float32
@@ -91,9 +92,9 @@ def test_activation_without_numpy_form() -> None:
 
 
 @ACTORS
-def test_parameters_return_in_place(ndbc: dict | None, tmp_path) -> None:
+def test_parameters_return_in_place(actor: dict, tmp_path) -> None:
     """Loading restores weights, moments and step count in place: training goes on as if nothing had happened."""
-    level, other = make_level(ndbc), make_level(ndbc, seed=2)
+    level, other = make_level(actor), make_level(actor, seed=2)
     level.train(5, 16)
     level.save(tmp_path / "level.zip")
     other.act(*inputs(other), True, np.random.default_rng(0))
@@ -114,7 +115,7 @@ def test_parameters_return_in_place(ndbc: dict | None, tmp_path) -> None:
 
 
 def test_loading_the_policy_alone_is_seen_by_act() -> None:
-    level, other = make_level(NDBC), make_level(NDBC, seed=2)
+    level, other = make_level({"ndbc": NDBC}), make_level({"ndbc": NDBC}, seed=2)
     args = (*inputs(level), True, np.random.default_rng(0))
     assert not np.allclose(level.act(*args)[0], other.act(*args)[0])
     other.policy.load_state_dict(level.policy.state_dict())
@@ -122,7 +123,7 @@ def test_loading_the_policy_alone_is_seen_by_act() -> None:
 
 
 def test_step_size_rule_reaches_acting_and_updates() -> None:
-    level = make_level({**NDBC, "adaptive_step": {"refresh_every": 4, "eta": 1e-3}})
+    level = make_level({"ndbc": {**NDBC, "adaptive_step": {"refresh_every": 4, "eta": 1e-3}}})
     level.actor.net.sub_steps = level.policy.average_actor.net.sub_steps = 3
     level.train(2, 16)
     assert set(level._update._steps) == {(16, 3)}
@@ -136,7 +137,7 @@ def test_step_size_rule_reaches_acting_and_updates() -> None:
 
 
 def test_same_seed_same_weights() -> None:
-    levels = [make_level(NDBC), make_level(NDBC)]
+    levels = [make_level({"ndbc": NDBC}), make_level({"ndbc": NDBC})]
     for level in levels:
         level.train(20, 16)
     assert th.equal(levels[0]._update.actor.vector, levels[1]._update.actor.vector)
@@ -193,7 +194,7 @@ def test_what_is_compiled_is_not_pickled() -> None:
 
 
 def test_the_actor_has_a_learning_rate_of_its_own() -> None:
-    level = make_level(NDBC, actor_learning_rate=0.0)
+    level = make_level({"ndbc": NDBC}, actor_learning_rate=0.0)
     actor, critic = (copy.deepcopy(part.state_dict()) for part in (level.policy.actor, level.policy.critic))
     level.train(2, 16)
     assert all(th.equal(value, actor[name]) for name, value in level.policy.actor.state_dict().items())
@@ -207,7 +208,7 @@ def test_the_actor_has_a_learning_rate_of_its_own() -> None:
 
 
 def test_policy_can_be_copied() -> None:
-    level = make_level(NDBC)
+    level = make_level({"ndbc": NDBC})
     level.train(1, 16)
     copied = copy.deepcopy(level.policy)
     obs = inputs(level)[0]
@@ -215,8 +216,8 @@ def test_policy_can_be_copied() -> None:
 
 
 @ACTORS
-def test_a_copied_level_trains_on_its_own(ndbc: dict | None) -> None:
-    level = make_level(ndbc)
+def test_a_copied_level_trains_on_its_own(actor: dict) -> None:
+    level = make_level(actor)
     level.train(2, 16)
     copied = copy.deepcopy(level)
     obs, states = inputs(level)
@@ -233,9 +234,9 @@ def test_a_copied_level_trains_on_its_own(ndbc: dict | None) -> None:
 
 
 @ACTORS
-def test_act_is_fast(ndbc: dict | None) -> None:
+def test_act_is_fast(actor: dict) -> None:
     """A wide bound (loaded machines): a torch forward pass takes 60 microseconds and more."""
-    level = make_level(ndbc, policy_kwargs={"net_arch": [32, 32]})
+    level = make_level(actor, policy_kwargs={"net_arch": [32, 32]})
     obs, states = inputs(level, 1)
     rng = np.random.default_rng(0)
     times = []
@@ -243,4 +244,4 @@ def test_act_is_fast(ndbc: dict | None) -> None:
         start = time.perf_counter()
         level.act(obs, states, False, rng)
         times.append(time.perf_counter() - start)
-    assert np.median(times) < (60e-6 if ndbc is None else 120e-6)
+    assert np.median(times) < (60e-6 if not actor else 120e-6)

@@ -15,7 +15,8 @@ OBSERVATIONS = spaces.Box(-np.inf, np.inf, (6,), np.float32)
 ACTIONS = spaces.Box(-2.0, 2.0, (3,), np.float32)
 NDBC = {"inter": 6, "command": 5, "motor": 3, "sensory_fanout": 3, "inter_fanout": 3,
         "recurrent_command_synapses": 4, "motor_fanin": 3, "sub_steps": 2, "input_scale": [2.0] * 6}  # fmt: skip
-ACTORS = pytest.mark.parametrize("ndbc", [None, NDBC], ids=["mlp", "ndbc"])
+GRU = {"hidden_size": 5, "input_scale": [2.0] * 6}
+ACTORS = pytest.mark.parametrize("actor", [{}, {"ndbc": NDBC}, {"gru": GRU}], ids=["mlp", "ndbc", "gru"])
 
 
 def make_policy(**kwargs: object) -> LevelPolicy:
@@ -24,8 +25,8 @@ def make_policy(**kwargs: object) -> LevelPolicy:
 
 
 @ACTORS
-def test_stock_calls_work(ndbc: dict | None) -> None:
-    policy = make_policy(ndbc=ndbc)
+def test_stock_calls_work(actor: dict) -> None:
+    policy = make_policy(**actor)
     obs = th.randn(4, 6)
     action, state = policy.predict(obs.numpy(), deterministic=True)
     assert action.shape == (4, 3)
@@ -38,8 +39,8 @@ def test_stock_calls_work(ndbc: dict | None) -> None:
 
 
 @ACTORS
-def test_step_from_rest_is_the_stock_forward(ndbc: dict | None) -> None:
-    policy = make_policy(ndbc=ndbc)
+def test_step_from_rest_is_the_stock_forward(actor: dict) -> None:
+    policy = make_policy(**actor)
     obs = th.randn(4, 6)
     mean, log_std, state = policy.actor.step(obs, th.zeros(4, policy.actor.state_dim))
     assert mean.shape == log_std.shape == (4, 3)
@@ -48,8 +49,8 @@ def test_step_from_rest_is_the_stock_forward(ndbc: dict | None) -> None:
 
 
 @ACTORS
-def test_blocks_give_the_same_forward(ndbc: dict | None) -> None:
-    actor = make_policy(ndbc=ndbc, mean_bound=0.2, log_std_bounds=(-0.1, 0.1)).actor
+def test_blocks_give_the_same_forward(actor: dict) -> None:
+    actor = make_policy(**actor, mean_bound=0.2, log_std_bounds=(-0.1, 0.1)).actor
     blocks = [th.cat([p.flatten() for p in b.parameters]).view(b.shape) for b in actor.blocks()]
     assert sum(p.numel() for p in actor.parameters()) == sum(b.numel() for b in blocks)
     obs, state = 3 * th.randn(4, 6), 0.3 * th.randn(4, actor.state_dim)
@@ -75,8 +76,8 @@ def test_critic_blocks_give_the_same_values(negative: bool, arch: list[int]) -> 
 
 
 @ACTORS
-def test_average_actor_starts_as_a_separate_copy_and_is_saved(ndbc: dict | None, tmp_path) -> None:
-    policy = make_policy(ndbc=ndbc, negative_critic=True)
+def test_average_actor_starts_as_a_separate_copy_and_is_saved(actor: dict, tmp_path) -> None:
+    policy = make_policy(**actor, negative_critic=True)
     pairs = list(zip(policy.actor.parameters(), policy.average_actor.parameters(), strict=True))
     assert all(th.equal(a, b) and a.data_ptr() != b.data_ptr() and not b.requires_grad for a, b in pairs)
     with th.no_grad():

@@ -244,14 +244,26 @@ def test_unknown_compile_value() -> None:
         make_level(make_batches(), compile="maybe").train(1, BATCH)
 
 
+CIRCUIT = {"inter": 5, "command": 4, "motor": 2, "sensory_fanout": 3, "inter_fanout": 3,
+           "recurrent_command_synapses": 3, "motor_fanin": 3}  # fmt: skip
+MEMORIES = pytest.mark.parametrize(
+    "actor",
+    [
+        {"ndbc": CIRCUIT},
+        {"ndbc": CIRCUIT, "critic_memory": True},
+        {"gru": {"hidden_size": 11, "input_scale": [1.0] * OBS_DIM}, "critic_memory": True},
+    ],
+    ids=["circuit", "circuit seen by critics", "gru seen by critics"],
+)
+
+
 @pytest.mark.slow
 @COMPILER
-def test_compiled_circuit_agrees_with_eager() -> None:
-    circuit = {"inter": 5, "command": 4, "motor": 2, "sensory_fanout": 3, "inter_fanout": 3,
-               "recurrent_command_synapses": 3, "motor_fanin": 3}  # fmt: skip
+@MEMORIES
+def test_compiled_memory_agrees_with_eager(actor: dict[str, object]) -> None:
     levels = []
     for compile in (False, True):
-        kwargs = {"policy_kwargs": {"net_arch": [8], "ndbc": circuit, "mean_bound": 3.0, "negative_critic": True}}
+        kwargs = {"policy_kwargs": {"net_arch": [8], "mean_bound": 3.0, "negative_critic": True, **actor}}
         level = make_level(make_batches(state_dim=11), compile, **kwargs)
         level.train(UPDATES, BATCH)
         levels.append(level)
@@ -260,6 +272,25 @@ def test_compiled_circuit_agrees_with_eager() -> None:
     assert len(levels[1]._update._steps) == 1
     for name, value in eager.items():
         assert th.allclose(compiled[name], value, rtol=0, atol=1e-5), name
+
+
+@pytest.mark.parametrize("sees", [False, True], ids=["blind", "seeing"])
+@pytest.mark.parametrize("moment", ["states", "next_states"])
+def test_critics_see_the_memory_where_they_are_to(moment: str, sees: bool) -> None:
+    # An actor that does not depend on its state, so that a memory can reach the critics by themselves alone.
+    gru = {"hidden_size": 4, "input_scale": [1.0] * OBS_DIM}
+    batches = make_batches(state_dim=4)
+    moved = batches._replace(**{moment: getattr(batches, moment) + 1.0})
+    weights = []
+    for given in (batches, moved):
+        kwargs = {"policy_kwargs": {"net_arch": [8], "gru": gru, "critic_memory": sees}}
+        level = make_level(given, False, **kwargs)
+        with th.no_grad():
+            level.policy.actor.net.readout.weight.zero_()
+        level.train(1, BATCH)
+        weights.append(level.policy.critic.state_dict())
+    same = all(th.equal(a, b) for a, b in zip(weights[0].values(), weights[1].values(), strict=True))
+    assert same != sees
 
 
 def test_label_loss_is_added_to_the_actors_loss() -> None:

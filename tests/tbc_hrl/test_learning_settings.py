@@ -124,3 +124,34 @@ def test_an_agent_takes_its_decisions_from_the_task(tmp_path) -> None:
     assert agent.rules.dt_max == pytest.approx(agent.episode_length / 10)
     agent.save(tmp_path / "agent.zip")
     assert TBCHRL.load(tmp_path / "agent.zip").max_options == 10
+
+
+@pytest.mark.parametrize(
+    ("networks", "said"),
+    [
+        ({"gru": 8}, r"gru of 8 needs ndbc: null"),
+        ({"ndbc": None, "critic_memory": True}, r"critic_memory needs an actor with a memory"),
+    ],
+)
+def test_memories_that_cannot_be_meant(networks: dict, said: str) -> None:
+    with pytest.raises(SettingError, match=said):
+        make_agent(low={"policy_kwargs": networks})
+
+
+@pytest.mark.parametrize("networks", [{"ndbc": None, "gru": 5}, {}], ids=["gru", "circuit"])
+def test_agents_with_a_memory_learn_act_and_are_saved(networks: dict, tmp_path) -> None:
+    low = {"policy_kwargs": {"net_arch": [8], "critic_memory": True, **networks}}
+    agent = make_agent(low=low, memory="window", sequence_length=3, max_options=20)
+    assert agent.low.policy.critic.q_networks[0][0].in_features == (
+        agent.low.observation_space.shape[0] + agent.low.state_dim + agent.low.action_space.shape[0]
+    )
+    agent.learn(200)
+    observation = agent.get_env().reset()
+    agent.save(tmp_path / "agent")
+    same = TBCHRL.load(tmp_path / "agent")
+    state = again = None
+    for _ in range(5):
+        action, state = agent.predict(observation, state, deterministic=True)
+        copy, again = same.predict(observation, again, deterministic=True)
+        np.testing.assert_array_equal(action, copy)
+    assert np.abs(state.membrane if hasattr(state, "membrane") else state[-1]).max() > 0

@@ -265,7 +265,7 @@ def test_an_ablation_may_have_settings_of_its_own(tmp_path: Path) -> None:
     assert low("tuned", "no-ndbc", "low.tau:0.9") == {"learning_rate": 0.3, "tau": 0.9}
     assert low("paper", "no-ndbc") == {"learning_rate": None, "tau": 0.1}
     path.write_text("T: {n_timesteps: 10, tuned: {no-ndbc: {low: {learning_rat: 0.3}}}}\n")
-    with pytest.raises(ConfigError, match="section T, tuned, no-ndbc: unknown setting 'low.learning_rat'"):
+    with pytest.raises(ConfigError, match=r"section T, tuned, no-ndbc: unknown setting 'low\.learning_rat'"):
         load_config("tbc-hrl", "T", path=path)
 
 
