@@ -8,7 +8,7 @@ export OMP_NUM_THREADS ?= 1
 ENV ?= Pendulum
 ALGO ?= tbc-hrl
 SEED ?= 0
-STEPS ?=
+STEPS ?= $(if $(filter Pendulum,$(ENV)),100000,)
 RUN := runs/$(shell date +%Y%m%d-%H%M%S)
 
 .PHONY: help install browser train test pytest pytest-slow type lint format check-codestyle commit-checks doc notebooks torture mutation bench report pretrained lowest newest clean
