@@ -29,13 +29,15 @@ class ShippedCircuit(NamedTuple):
     config: str  # "paper" (table A1) or "tuned"
     wiring: NDBCWiring
     sub_steps: int
+    synapses: str  # "paper" or "lean"
     n_actions: int
     hidden: list[int]  # widths of the MLP it replaces, the low level of HiTS
 
     @property
     def title(self) -> str:
-        """Task; configuration and K if they are not those of table A1."""
-        return self.task if self.config == "paper" else f"{self.task}, {self.config}, K = {self.sub_steps}"
+        """Task; configuration, K and synapses if they are not those of the paper."""
+        lean = ", lean" if self.synapses == "lean" else ""
+        return self.task if self.config == "paper" else f"{self.task}, {self.config}, K = {self.sub_steps}{lean}"
 
 
 def shipped_circuits() -> list[ShippedCircuit]:
@@ -44,7 +46,7 @@ def shipped_circuits() -> list[ShippedCircuit]:
     for task in PAPER_TASKS:
         paper, tuned = (_shipped_circuit(task, config) for config in ("paper", "tuned"))
         found.append(paper)
-        if (tuned.wiring, tuned.sub_steps) != (paper.wiring, paper.sub_steps):
+        if tuned._replace(config="paper", n_actions=0, hidden=[]) != paper._replace(n_actions=0, hidden=[]):
             found.append(tuned)
     return found
 
@@ -68,11 +70,13 @@ def _shipped_circuit(task: str, config: str) -> ShippedCircuit:
     env = gym.make(f"sb3_tbc/{task}-v0", **settings.env_kwargs)
     subgoals = env.unwrapped.subgoals  # type: ignore[attr-defined]
     numbers = settings.model["low"]["policy_kwargs"]["ndbc"]
-    wiring = NDBCWiring(subgoals.local_dim + subgoals.dim + 1, **{name: numbers[name] for name in WIRING_NUMBERS})
+    drawn = {name: numbers[name] for name in (*WIRING_NUMBERS, "sensory_to") if name in numbers}
+    wiring = NDBCWiring(subgoals.local_dim + subgoals.dim + 1, **drawn)
     hidden = load_config("hits", task, config).model["low"]["policy_kwargs"]["net_arch"]
     n_actions = env.action_space.shape[0]  # type: ignore[index]
     env.close()
-    return ShippedCircuit(task, config, wiring, numbers.get("sub_steps", 3), n_actions, hidden)
+    options = (numbers.get("sub_steps", 3), numbers.get("synapses", "paper"))
+    return ShippedCircuit(task, config, wiring, *options, n_actions, hidden)
 
 
 def parameters() -> tuple[list[str], Plain]:
@@ -84,7 +88,8 @@ def parameters() -> tuple[list[str], Plain]:
     rows = []
     for circuit in shipped_circuits():
         wiring = circuit.wiring
-        count = count_parameters(NDBCNet(wiring.n_inputs, 2 * circuit.n_actions, wiring, seed=0), circuit.hidden)
+        net = NDBCNet(wiring.n_inputs, 2 * circuit.n_actions, wiring, seed=0, synapses=circuit.synapses)
+        count = count_parameters(net, circuit.hidden)
         row = {"task": circuit.task, "config": circuit.config, "hidden": circuit.hidden}
         rows.append({**row, **count._asdict(), "share": count.ratio})
         widths = "x".join(str(h) for h in circuit.hidden)

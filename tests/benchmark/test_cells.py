@@ -27,6 +27,7 @@ def test_a_tuned_circuit_is_named_beside_table_a1s() -> None:
     paper, tuned = found["Pendulum"], found["Pendulum, tuned, K = 6"]
     assert paper.wiring.n_inputs == tuned.wiring.n_inputs
     assert paper.wiring.n_synapses < tuned.wiring.n_synapses
+    assert found["UR5Reacher, tuned, K = 3, lean"].wiring.sensory_to == ("inter", "command", "motor")
 
 
 def test_a_curve_that_bends_is_not_called_straight() -> None:

@@ -105,6 +105,15 @@ def test_a_schedule_is_written_as_text() -> None:
     assert constant.model["high"]["learning_rate"] == 5.216e-4
 
 
+def test_an_actor_without_a_rate_of_its_own_has_its_critics() -> None:
+    run = load_config("tbc-hrl", "Pendulum", "paper")
+    space = build_space(load_space("tbc-hrl", "Pendulum"))
+    assert project(space, run)["low.actor_learning_rate"] == project(space, run)["low.learning_rate"] == 6.763e-3
+    changed = apply(space, {"learning_rate_schedule": "linear", "low.actor_learning_rate": 0.25}, run)
+    assert changed.model["low"]["actor_learning_rate"] == "lin_0.25"
+    assert changed.model["low"]["learning_rate"] == "lin_0.006763"
+
+
 def test_a_value_outside_of_a_range_is_left_out() -> None:
     run = load_config("tbc-hrl", "Drawbridge", "paper")
     space = build_space(
