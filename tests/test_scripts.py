@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ast
+import importlib
 import importlib.util
 import io
 import json
@@ -24,6 +26,18 @@ def script(name: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+OTHERS = sorted([*SCRIPTS.rglob("*.py"), *(SCRIPTS.parent / "docs" / "images").glob("*.py")])
+
+
+@pytest.mark.parametrize("path", OTHERS, ids=[path.name for path in OTHERS])
+def test_what_a_script_imports_from_the_package_is_there(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("sb3_tbc"):
+            module = importlib.import_module(node.module or "")
+            for name in (alias.name for alias in node.names):
+                assert hasattr(module, name) or importlib.util.find_spec(f"{node.module}.{name}"), (path.name, name)
 
 
 def test_a_picture_gets_coarser_until_it_fits() -> None:

@@ -9,7 +9,7 @@ import matplotlib as mpl
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-from sb3_tbc.benchmark.cells import shipped_circuits
+from sb3_tbc.benchmark.circuits import shipped_circuits
 
 circuits = shipped_circuits()
 figure, axes = plt.subplots(-(-len(circuits) // 2), 2, figsize=(12, 4.7 * -(-len(circuits) // 2)))
