@@ -36,6 +36,8 @@ REASON = "reason"
 """Trial attribute: why a trial was pruned."""
 WORKER = "worker"
 """Trial attribute: the worker that runs it."""
+LONGEST_WAIT = 20.0
+"""Seconds to wait for the settings of a study that another machine is creating."""
 COUNTED = (TrialState.COMPLETE, TrialState.PRUNED)
 """States of trials that are done; a failed trial is not, because it is run again."""
 MAX_RETRIES = 3
@@ -276,7 +278,7 @@ def open_study(
 
 def _wait_for_settings(study: Study) -> None:
     """Wait while another machine creates the study, which then has neither trials nor settings yet."""
-    for _ in range(200):
+    for _ in range(round(10 * LONGEST_WAIT)):
         if SETTINGS in study.user_attrs or study.get_trials(deepcopy=False):
             return
         time.sleep(0.1)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_tbc.tune import command
+from sb3_tbc.tune import command, study
 
 SMALL = ["--env", "Pendulum", "--n-timesteps", "200", "--eval-freq", "200", "--n-seeds", "1", "--n-eval-episodes", "1"]
 SMALL += ["--n-final-episodes", "1", "--n-trials", "1", "--hyperparams", "compile:false", "gradient_ratio:0.01"]
@@ -27,7 +27,10 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ["study.log", "study.db"])
-def test_one_line_or_read(name: str, begun: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_one_line_or_read(
+    name: str, begun: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(study, "LONGEST_WAIT", 0.1)  # no other machine is about to write what is missing
     whole = (begun / name).read_bytes()
     told = 0
     for k in range(25):
