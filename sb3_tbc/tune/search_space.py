@@ -299,7 +299,7 @@ def restrict(
         without = (parameter.keys and not keys) or any(_is_set(fixed, k) for s in parameter.sets.values() for k in s)
         if without or (wanted and not any(fnmatch.fnmatch(name, pattern) for pattern in wanted)):
             continue
-        if any(key.startswith(idle) for key in keys):
+        if any(key.startswith(idle) for key in (*keys, *(k for s in parameter.sets.values() for k in s))):
             continue
         fields = dict(declared[name])
         if parameter.when and parameter.when[0] not in left:

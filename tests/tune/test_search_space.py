@@ -140,7 +140,8 @@ def test_what_the_command_line_fixes_is_not_searched() -> None:
     assert left["tau"]["keys"] == ["high.tau"]
     assert not {"memory", "low.ent_coef", "low.temperature"} & set(left)
     few = restrict(declared, run, ["*learning_rate", "low.target_entropy", "low.ent_coef"], {})
-    assert set(few) == {"low.learning_rate", "high.learning_rate", "low.target_entropy"}  # Pendulum's low level is auto
+    rates = {"low.learning_rate", "low.actor_learning_rate", "high.learning_rate"}
+    assert set(few) == {*rates, "low.target_entropy"}  # Pendulum's low level is auto
     assert "when" not in few["low.target_entropy"]
     with pytest.raises(
         ConfigError, match=r"'low\.lerning_rate' matches no parameter; did you mean 'low\.learning_rate'"
