@@ -7,6 +7,7 @@ as a function of those blocks, which is what the update differentiates.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -199,9 +200,9 @@ class MemoryActor(BasePolicy):
         bounds = {"mean_bound": self.head.mean_bound, "log_std_bounds": self.head.log_std_bounds}
         return {**super()._get_constructor_parameters(), "settings": self.settings, **bounds}
 
+    @abstractmethod
     def make_net(self, n_inputs: int, n_outputs: int) -> Any:
         """The network, a :class:`MemoryNet`; its weights are drawn from torch's generator."""
-        raise NotImplementedError
 
     def step(self, obs: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """One control step: mean and log_std ``(batch, action_dim)`` and the next state ``(batch, state_dim)``."""

@@ -190,6 +190,12 @@ class TBCConfig(AgentConfig):
     def check(self) -> None:
         """Refuse what cannot be meant together."""
         super().check()
+        if self.low.policy_kwargs.critic_memory and self.memory == "none":
+            raise SettingError(
+                "low.policy_kwargs.critic_memory",
+                "shows the critics the low level's memory, but memory='none' keeps none: use memory='window' or "
+                "memory='episode'",
+            )
         if self.low.goal_strategy is not None and self.low_reward != "step":
             raise SettingError(
                 "low.goal_strategy",

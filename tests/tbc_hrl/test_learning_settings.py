@@ -131,6 +131,7 @@ def test_an_agent_takes_its_decisions_from_the_task(tmp_path) -> None:
     [
         ({"gru": 8}, r"gru of 8 needs ndbc: null"),
         ({"ndbc": None, "critic_memory": True}, r"critic_memory needs an actor with a memory"),
+        ({"critic_memory": True}, r"critic_memory shows the critics .* memory='none' keeps none"),
     ],
 )
 def test_memories_that_cannot_be_meant(networks: dict, said: str) -> None:
