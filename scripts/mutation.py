@@ -27,7 +27,7 @@ SUBJECTS = {
         ["tests/report/test_tables.py"],
     ),
     "hindsight": (["sb3_tbc/smdp/hindsight.py"], ["tests/smdp/test_hindsight.py"]),
-    "buffers": (["sb3_tbc/replay/buffers.py"], ["tests/replay/test_buffers.py"]),
+    "buffers": (["sb3_tbc/replay/buffers.py"], ["tests/replay/test_buffers.py", "tests/tbc_hrl/test_reachability.py"]),
     "evaluation": (["sb3_tbc/tbc_hrl/evaluation.py"], ["tests/tbc_hrl/test_evaluation.py"]),
 }  # fmt: skip
 """Name -> modules that are changed, and the tests that ought to notice."""
@@ -52,8 +52,11 @@ def score_of(exit_codes: Mapping[str, int | None]) -> Score:
     return Score(len(tried), sorted(name for name, code in tried.items() if code in (LIVED, BY_NO_TEST)))
 
 
-def mutate(name: str, digits: str, minutes: float) -> Score:
-    """Try mutants of a subject in a copy of the package, for so many minutes at most."""
+def mutate(name: str, digits: str, minutes: float) -> tuple[Score, dict[str, str]]:
+    """Try mutants of a subject in a copy of the package, for so many minutes at most.
+
+    :return: the score, and what those that lived had changed
+    """
     modules, tests = SUBJECTS[name]
     settings = {
         "source_paths": ["sb3_tbc"],
@@ -77,7 +80,15 @@ def mutate(name: str, digits: str, minutes: float) -> Score:
         except subprocess.TimeoutExpired:
             print(f"{name}: stopped after {minutes:g} minutes; the score is of the mutants tried until then")
         records = [json.loads(path.read_text(encoding="utf-8")) for path in Path(folder, "mutants").rglob("*.meta")]
-    return score_of({mutant: code for record in records for mutant, code in record["exit_code_by_key"].items()})
+        score = score_of({mutant: code for record in records for mutant, code in record["exit_code_by_key"].items()})
+        return score, {mutant: changed_lines(mutant, folder) for mutant in score.alive}
+
+
+def changed_lines(mutant: str, folder: str) -> str:
+    """The lines that a mutant takes away and adds."""
+    command = [sys.executable, "-m", "mutmut", "show", mutant]
+    shown = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=True).stdout.splitlines()
+    return "\n".join(line for line in shown if line.startswith(("+", "-")) and not line.startswith(("+++", "---")))
 
 
 def main() -> None:
@@ -92,10 +103,10 @@ def main() -> None:
     if not args.digits.isdigit():
         parser.error(f"--digits must be digits, e.g. 147, got {args.digits!r}")
     for name in args.subjects or SUBJECTS:
-        score = mutate(name, args.digits, args.minutes)
+        score, changed = mutate(name, args.digits, args.minutes)
         print(f"{name:<12}{score}", flush=True)
-        for mutant in score.alive:
-            print(f"    lived  {mutant}", flush=True)
+        for mutant, lines in changed.items():
+            print(f"    lived  {mutant}\n{lines}", flush=True)
 
 
 if __name__ == "__main__":

@@ -82,6 +82,14 @@ def test_ring_never_mixes_windows_after_wrapping() -> None:
     assert buffer.size() == 13
 
 
+def test_a_full_ring_relabels_its_newest_window_too() -> None:
+    buffer = low_buffer(10, hindsight=1e9)  # two episodes fit to the row
+    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    for _ in range(3):
+        buffer.extend(steps._replace(subgoal=np.full_like(steps.subgoal, 0.9)))
+    assert buffer.sample_burst(1, 500).observations[..., 3].max() < 0.65  # 0.9 was asked for, 0.5 reached at most
+
+
 def test_option_buffer_gives_sb3_samples_with_discounts() -> None:
     buffer = OptionReplayBuffer(50, LAYOUT.high_space(ENV.observation_space), LAYOUT.high_action_space(), seed=0)
     reward = HighLevelReward("smdp", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
@@ -160,6 +168,14 @@ def test_burn_in_recomputes_memory_through_the_window() -> None:
     before, after = np.array([0, 0, 0.1, 0, 0.3]), np.array([0, 0.1, 0.25, 0.3, 0.55])
     np.testing.assert_allclose(batch.states[0, :, 0].numpy(), before[row], atol=1e-6)
     np.testing.assert_allclose(batch.next_states[0, :, 1].numpy(), after[row], atol=1e-6)
+
+
+def test_without_burn_in_the_stored_states_are_sampled() -> None:
+    buffer = low_buffer(100, hindsight=0, advance=lambda observations, states: states + 10.0)
+    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    batch = buffer.sample_burst(1, 50)
+    assert set(batch.states.unique().tolist()) == {0.0}
+    assert set(batch.next_states.unique().tolist()) == {1.0}
 
 
 def test_burn_in_starts_from_the_stored_state_where_it_is_shorter_than_the_window() -> None:

@@ -31,6 +31,8 @@ def test_low_level_transitions_of_two_windows() -> None:
     np.testing.assert_array_equal(steps.dones, [False, False, True, False, True])
     np.testing.assert_array_equal(steps.rewards, [0, 0, 0, 0, 1])
     np.testing.assert_allclose(steps.achieved[:, 0], [0.1, 0.2, 0.3, 0.4, 0.5])
+    for kept in ("actions", "states", "next_states"):
+        np.testing.assert_array_equal(getattr(steps, kept), getattr(episode(), kept))
 
 
 def test_window_cut_by_the_episode_is_not_over_for_the_low_level() -> None:
