@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -9,7 +11,7 @@ import pytest
 from corridor import Corridor
 
 from sb3_tbc import TBCHRL
-from sb3_tbc.tbc_hrl.evaluation import evaluate_agent, evaluate_hierarchical
+from sb3_tbc.tbc_hrl.evaluation import evaluate_agent, evaluate_flat, evaluate_hierarchical
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.policy import TwoLevelState
 
@@ -65,6 +67,26 @@ def test_flat_evaluations_draw_nothing() -> None:
     assert len(set(evaluate_agent(model, env, 4, seed=0).rewards)) == 1
     noisy = evaluate_agent(model, env, 4, seed=0, deterministic=False)
     assert len(set(zip(noisy.lengths, noisy.rewards, strict=True))) > 1
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_either_kind_of_agent_is_evaluated_as_it_was_asked(flat: bool) -> None:
+    model = FlatSAC("MultiInputPolicy", Corridor(), buffer_size=100, seed=0) if flat else make()
+    evaluate = evaluate_flat if flat else evaluate_hierarchical
+    for deterministic in (True, False):
+        model.set_random_seed(0)
+        one = evaluate_agent(model, Corridor(), 1, 7, deterministic)
+        model.set_random_seed(0)
+        other = evaluate(model, Corridor(), 1, seed=7, deterministic=deterministic)
+        assert [c.tolist() for c in one[:3]] == [c.tolist() for c in other[:3]]
+        assert [c.dtype.kind for c in one] == list("bifffib")
+    with pytest.raises(ValueError, match="n_eval_episodes must be at least 1, got 0"):
+        evaluate_agent(model, Corridor(), 0)
+
+
+@pytest.mark.parametrize("evaluate", [evaluate_agent, evaluate_flat, evaluate_hierarchical])
+def test_the_paper_evaluates_a_hundred_episodes(evaluate: Callable[..., Any]) -> None:
+    assert inspect.signature(evaluate).parameters["n_eval_episodes"].default == 100
 
 
 @pytest.mark.parametrize(("dt_min", "windows"), [(0.0, [1] * 8), (4.0, [1, 2, 3, 4, 1, 2, 3, 4])])
