@@ -16,7 +16,7 @@ ACTIONS = spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 COMPILER = pytest.mark.skipif(compilation.compiler_problem() is not None, reason="no C++ compiler")
 
 
-def make_batches(seed: int = 0, state_dim: int = 0, updates: int = UPDATES) -> LevelBatch:
+def make_batches(seed: int = 0, state_dim: int = 0, updates: int = UPDATES, earlier_steps: int = 0) -> LevelBatch:
     g = th.Generator().manual_seed(seed)
 
     def draw(width: int) -> th.Tensor:
@@ -25,7 +25,9 @@ def make_batches(seed: int = 0, state_dim: int = 0, updates: int = UPDATES) -> L
     discounts = 0.9 + 0.1 * th.rand(updates, BATCH, 1, generator=g)
     dones = (draw(1) > 1.0).float()
     states = (0.3 * draw(state_dim), 0.3 * draw(state_dim))
-    return LevelBatch(draw(OBS_DIM), th.tanh(draw(ACTION_DIM)), draw(OBS_DIM), draw(1), dones, discounts, *states)
+    plain = draw(OBS_DIM), th.tanh(draw(ACTION_DIM)), draw(OBS_DIM), draw(1)
+    earlier = [part for _ in range(earlier_steps) for part in ((draw(1) > 0).float(), draw(OBS_DIM))]
+    return LevelBatch(*plain, dones, discounts, *states, th.cat([draw(0), *earlier], dim=-1))
 
 
 class FixedBuffer:

@@ -225,10 +225,6 @@ class FrozenActor:
             chosen = noise
         return np.tanh(chosen, dtype=self._dtype).astype(np.float32, copy=False), next_states
 
-    def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
-        """States ``(n, state_dim)`` after a step with these observations."""
-        return self._current()(observations, states)[1]
-
     def _current(self) -> FrozenNet:
         if self._version != self._policy.weights_version:
             self._net.refresh()

@@ -70,6 +70,7 @@ class SACLevel(SAC):
     :param average_decay: decay per update of the averaged actor, which acts where deterministic actions are asked for
     :param bounds: targets of the critics are clipped to them, see :mod:`sb3_tbc.smdp.bounds`; None does not clip
     :param actor_q: which value of the critics the actor climbs, see :class:`.SACUpdate`
+    :param earlier_steps: steps before each sample through which the actor's memory is unrolled, see :class:`.SACUpdate`
 
     Other parameters are SB3's; ``policy_kwargs`` are :class:`LevelPolicy`'s.
     """
@@ -98,6 +99,7 @@ class SACLevel(SAC):
         average_decay: float = AVERAGE_DECAY,
         bounds: ValueBounds | None = None,
         actor_q: str | float = "min",
+        earlier_steps: int = 0,
     ) -> None:
         super().__init__(
             LevelPolicy if isinstance(policy, str) else policy,
@@ -118,7 +120,7 @@ class SACLevel(SAC):
         self.actor_lr_schedule = None if actor_learning_rate is None else FloatSchedule(actor_learning_rate)
         self.log_prefix = f"{name}/"
         self.label_coef, self.average_decay = label_coef, average_decay
-        self.bounds, self.actor_q = bounds, actor_q
+        self.bounds, self.actor_q, self.earlier_steps = bounds, actor_q, earlier_steps
         self.set_logger(Logger(folder=None, output_formats=[]))
         self._setup_model()
         self.replay_buffer = replay_buffer  # type: ignore[assignment]
@@ -137,6 +139,7 @@ class SACLevel(SAC):
             average_decay=self.average_decay,
             bounds=self.bounds,
             actor_q=self.actor_q,
+            earlier_steps=self.earlier_steps,
         )
         self._frozen = {average: FrozenActor(self.policy, average) for average in (False, True)}
 
@@ -282,7 +285,3 @@ class SACLevel(SAC):
                 th.as_tensor(x, dtype=th.float32, device=self.device) for x in (observations, unit_actions)
             )
             return np.asarray(th.cat(self.policy.critic(seen, actions), dim=1).min(dim=1).values.cpu().numpy())
-
-    def advance(self, observations: FloatArray, states: FloatArray) -> FloatArray:
-        """Memory states ``(n, state_dim)`` after a step with these observations, from the current weights."""
-        return self._frozen[False].advance(observations, states)

@@ -81,6 +81,8 @@ class SACUpdate:
     :param actor_q: which value of the critics the actor climbs: ``"min"`` as in SAC, ``"mean"``, ``"max"``, or a number
         between 0 (the smallest) and 1 (the largest). Small actors beside large critics learn less of a pessimistic one
         (arXiv 2506.01016). Targets always take the smallest
+    :param earlier_steps: steps before each sample that batches hold: the actor's memory is unrolled through them from
+        what was stored, with today's weights, and learns by backpropagation through time
     :raises ValueError: for bounds that hold nothing and another ``actor_q``
     """
 
@@ -94,6 +96,7 @@ class SACUpdate:
         average_decay: float = AVERAGE_DECAY,
         bounds: ValueBounds | None = None,
         actor_q: str | float = "min",
+        earlier_steps: int = 0,
     ) -> None:
         if bounds is not None and not bounds.low < bounds.high:
             raise ValueError(f"target_bounds must be [low, high] with low < high, got [{bounds.low}, {bounds.high}]")
@@ -110,7 +113,7 @@ class SACUpdate:
         self.ent_coef_optimizer = ent_coef_optimizer
         self.action_dim = math.prod(policy.action_space.shape or (1,))
         self.compile = compile
-        self.label_coef, self.average_decay = label_coef, average_decay
+        self.label_coef, self.average_decay, self.earlier_steps = label_coef, average_decay, earlier_steps
         self._steps: dict[tuple[int, int], Callable[..., None]] = {}
         self._shapes: dict[int, list[th.Size]] = {}  # of what an update is given, by batch size
 
@@ -190,6 +193,7 @@ class SACUpdate:
                 discounts=th.zeros(batch_size, 1),
                 states=th.zeros(batch_size, state_dim),
                 next_states=th.zeros(batch_size, state_dim),
+                earlier=th.zeros(batch_size, self.earlier_steps * (1 + obs_dim)),
             ),
         )
 
@@ -284,10 +288,12 @@ class SACUpdate:
     def _step(self, *leaves: th.Tensor) -> None:
         """One update, from the leaves of :class:`StepInputs`."""
         x: StepInputs = tree_unflatten(list(leaves), self._structure)
-        state, batch, row = x.state, x.given.batch, Schedules(*x.given.row.unbind())
+        state, row = x.state, Schedules(*x.given.row.unbind())
         with th.enable_grad():
             actor_leaf = state.actor.detach().requires_grad_()
-            actions_pi, log_prob = self._sample(actor_leaf, x, batch.observations, batch.states, x.given.noise[0])
+            x, memory = self._unrolled(actor_leaf, x)
+            seen = x.given.batch.observations
+            actions_pi, log_prob = self._sample(actor_leaf, x, seen, memory, x.given.noise[0])
         ent_coef = state.ent.exp() if self.automatic else state.ent.clone()
         surplus = (log_prob.detach() + row.target_entropy).mean()
 
@@ -313,6 +319,24 @@ class SACUpdate:
         # At the end: a change in place in the middle would keep the compiler from sharing what is computed twice.
         so_far = state.extremes.unbind()
         state.extremes.copy_(th.stack((th.minimum(so_far[0], lowest), th.maximum(so_far[1], highest))))
+
+    def _unrolled(self, vector: th.Tensor, x: StepInputs) -> tuple[StepInputs, th.Tensor]:
+        """Bring the memory up to the sampled steps.
+
+        :return: inputs whose batch has the memory before and after the sampled steps, without gradient; and the memory
+            before them, ``(batch, state_dim)``, with its gradient
+        """
+        batch = x.given.batch
+        memory = batch.states
+        if not self.earlier_steps:
+            return x, memory
+        blocks, constants = self.actor.unflatten(vector), x.state.constants
+        for step in batch.earlier.view(len(batch.earlier), self.earlier_steps, -1).unbind(1):
+            *_, after = self.policy.actor.step_blocks(blocks, constants, step[:, 1:], memory)
+            memory = th.where(step[:, :1] > 0, after, memory)
+        *_, after = self.policy.actor.step_blocks(blocks, constants, batch.observations, memory)
+        batch = batch._replace(states=memory.detach(), next_states=after.detach())
+        return x._replace(given=x.given._replace(batch=batch)), memory
 
     def _sample(
         self, vector: th.Tensor, x: StepInputs, obs: th.Tensor, membrane: th.Tensor, noise: th.Tensor

@@ -10,7 +10,8 @@ import torch as th
 class LevelBatch(NamedTuple):
     """A replay sample of one level; leading dimensions ``(batch,)`` or ``(gradient_steps, batch)``, float32.
 
-    ``states`` are the membrane potentials an NDBC actor started the step from (width 0 for an MLP actor);
+    ``states`` are the membrane potentials an NDBC actor started the step from (width 0 for an MLP actor). Where
+    ``earlier`` holds steps of the same window, they are those before the first of them.
     ``discounts`` is gamma per transition (gamma**duration on the high level), not yet multiplied by ``1 - dones``.
     """
 
@@ -22,3 +23,4 @@ class LevelBatch(NamedTuple):
     discounts: th.Tensor  # (..., 1)
     states: th.Tensor  # (..., state_dim)
     next_states: th.Tensor  # (..., state_dim)
+    earlier: th.Tensor  # (..., time * (1 + observation_dim)): whether the window had begun, and what was observed

@@ -23,9 +23,6 @@ from sb3_tbc.smdp.views import LevelViews
 Teacher = Callable[[Float32, Float32, Float32], Float32]
 """Maps high-level observations, local states and subgoal-space points to unit time budgets to imitate, ``(n,)``."""
 
-Advance = Callable[[Float32, Float32], Float32]
-"""Maps low-level observations and memory states to the next states, from the current weights."""
-
 HINDSIGHT_SUBGOALS = ("timed", "future", "episode")
 
 
@@ -95,7 +92,7 @@ class OptionReplayBuffer(RingBuffer):
     @staticmethod
     def _batch(taken: dict[str, Float32]) -> tuple[Float32, ...]:
         no_state = np.zeros((len(taken["rewards"]), 0), dtype=np.float32)
-        return (*(taken[name] for name in LevelBatch._fields[:6]), no_state, no_state)
+        return (*(taken[name] for name in LevelBatch._fields[:6]), no_state, no_state, no_state)
 
 
 class SubgoalReplayBuffer(RingBuffer):
@@ -111,10 +108,9 @@ class SubgoalReplayBuffer(RingBuffer):
     :param n_hindsight_goals: n above, relabelled samples per plain one
     :param reward: the low level's reward, by default the sparse one
     :param hindsight: ``"timed"``, ``"future"`` or ``"episode"``
-    :param sequence_length: with more than 1, memory states are not the stored ones but recomputed by ``advance``
-        through up to ``sequence_length - 1`` preceding steps of the same window, under the sampled subgoal
+    :param sequence_length: with more than 1, samples hold up to ``sequence_length - 1`` earlier steps of their window,
+        under the sampled subgoal, and the memory before the first of these
     :param reach_pairs: keep what :meth:`sample_pairs` needs
-    :param advance: computes the memory states of the next step; without it the stored ones are sampled
     :raises ValueError: if ``hindsight`` is unknown or ``sequence_length`` not positive, or more than 1 without memory
     """
 
@@ -134,7 +130,6 @@ class SubgoalReplayBuffer(RingBuffer):
         hindsight: str = "timed",
         sequence_length: int = 1,
         reach_pairs: bool = False,
-        advance: Advance | None = None,
     ) -> None:
         if hindsight not in HINDSIGHT_SUBGOALS:
             raise ValueError(f"hindsight must be one of {', '.join(HINDSIGHT_SUBGOALS)}, got {hindsight!r}")
@@ -142,7 +137,7 @@ class SubgoalReplayBuffer(RingBuffer):
             raise ValueError(f"sequence_length must be at least 1 (no burn-in), got {sequence_length}")
         if sequence_length > 1 and not state_dim:
             raise ValueError(
-                f"sequence_length={sequence_length} recomputes the low level's memory, but it has none: use "
+                f"sequence_length={sequence_length} unrolls the low level's memory, but it has none: use "
                 "sequence_length=1, or a circuit (low.policy_kwargs.ndbc)"
             )
         subgoals = views.subgoals
@@ -167,7 +162,6 @@ class SubgoalReplayBuffer(RingBuffer):
         self.views, self.rules, self.gamma = views, rules, gamma
         self.reward = reward or LowLevelReward("sparse", subgoals, rules)
         self.hindsight, self.n_hindsight_goals, self.sequence_length = hindsight, n_hindsight_goals, sequence_length
-        self.advance = advance
 
     def extend(self, steps: LowLevelSteps) -> None:
         """Add the transitions of an episode, in the order they happened."""
@@ -220,7 +214,7 @@ class SubgoalReplayBuffer(RingBuffer):
             rewards,
             dones,
             np.full_like(rewards, self.gamma),
-            *self._states(at, taken, observations),
+            *self._memory(at, taken),
         )
 
     def _timed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -261,28 +255,25 @@ class SubgoalReplayBuffer(RingBuffer):
             return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
         return self.reward.rewards_and_ends(here, achieved, subgoal, expired, may_end)
 
-    def _states(
-        self, at: NDArray[np.int64], taken: dict[str, Float32], observations: Float32
-    ) -> tuple[Float32, Float32]:
-        """Memory states before and after the sampled steps: the stored ones, or recomputed by a burn-in.
+    def _memory(self, at: NDArray[np.int64], taken: dict[str, Float32]) -> tuple[Float32, Float32, Float32]:
+        """Memory before and after the sampled steps, and the steps before them, as :class:`.LevelBatch` has these.
 
         :param taken: the sampled rows, with the subgoals and times that they are relabelled with
         """
-        if self.sequence_length == 1 or self.advance is None:
-            return taken["states"], taken["next_states"]
+        width = self.sequence_length - 1, 1 + self.views.low_space().shape[0]
+        earlier = np.zeros((len(at), *width), dtype=np.float32)
         position, length = (taken[name][:, 0].astype(np.int64) for name in ("position", "length"))
         back = np.minimum(position, self.sequence_length - 1)
         back[~self._intact(at - position, length)] = 0
-        states = self.data["states"][(at - back) % self.buffer_size]
-        for steps in range(self.sequence_length - 1, 0, -1):
+        for column, steps in enumerate(range(self.sequence_length - 1, 0, -1)):
             rows = np.flatnonzero(back >= steps)
-            earlier = (at[rows] - steps) % self.buffer_size
+            before = (at[rows] - steps) % self.buffer_size
             left = np.clip((taken["time_left"][rows] + steps) / np.float32(self.rules.dt_max), 0.0, 1.0)
-            seen = self.views.low_from(
-                self.data["local"][earlier], self.data["here"][earlier], taken["subgoal"][rows], left
-            )
-            states[rows] = self.advance(seen, states[rows])
-        return states, self.advance(observations, states)
+            local, here = self.data["local"][before], self.data["here"][before]
+            earlier[rows, column, 0] = 1.0
+            earlier[rows, column, 1:] = self.views.low_from(local, here, taken["subgoal"][rows], left)
+        states = self.data["states"][(at - back) % self.buffer_size]
+        return states, taken["next_states"], earlier.reshape(len(at), -1)
 
     def _intact(self, begin: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Which windows still have all their rows; the one at the write position is partly overwritten."""

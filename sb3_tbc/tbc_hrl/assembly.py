@@ -210,6 +210,7 @@ def _make_level(
         compile=config.compile,
         name=name,
         label_coef=config.duration_loss_coef if name == "high" else 0.0,
+        earlier_steps=config.sequence_length - 1 if name == "low" else 0,
         average_decay=level.average_decay,
         bounds=bounds,
         actor_q=level.actor_q,
@@ -270,5 +271,4 @@ def make_low_buffer(
         hindsight=(own.goal_strategy or config.goal_strategy) if config.low_reward == "step" else "timed",
         sequence_length=config.sequence_length,
         reach_pairs=config.duration == "rule" or config.duration_loss_coef > 0,
-        advance=low.advance,
     )

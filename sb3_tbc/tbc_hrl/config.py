@@ -124,8 +124,9 @@ class AgentConfig(Settings):
     memory: Literal["window", "episode", "none"] = "none"
     """When the circuit's memory is reset. ``window``: when a window ends. ``episode``: when the episode ends. ``none``:
     at every step, so that nothing is remembered."""
-    sequence_length: Annotated[int, Range(1, 1000)] = 1
-    """Number of steps through which an update of the low level recomputes its memory; 1: the stored memory is used."""
+    sequence_length: Annotated[int, Range(1, 64)] = 1
+    """Number of steps through which an update of the low level unrolls its memory and learns by backpropagation through
+    time; 1: the stored memory is used as it is."""
     relative_subgoals: bool = False
     """Show the low level the distance to its subgoal instead of the subgoal itself."""
     compile: bool | Literal["auto"] = "auto"
@@ -157,7 +158,7 @@ class AgentConfig(Settings):
         if self.sequence_length > 1 and self.memory == "none":
             raise SettingError(
                 "sequence_length",
-                f"of {self.sequence_length} recomputes the low level's memory, but memory='none' keeps none: use "
+                f"of {self.sequence_length} unrolls the low level's memory, but memory='none' keeps none: use "
                 "memory='window' or sequence_length=1",
             )
         if self.duration_loss_coef and self.duration != "joint":

@@ -35,7 +35,7 @@ class RandomBuffer:
 
         dones, discounts = (draw(1) > 1).float(), th.full((gradient_steps, batch_size, 1), 0.97)
         states = (0.3 * draw(self.state_dim), 0.3 * draw(self.state_dim))
-        return LevelBatch(draw(6), th.tanh(draw(3)), draw(6), draw(1), dones, discounts, *states)
+        return LevelBatch(draw(6), th.tanh(draw(3)), draw(6), draw(1), dones, discounts, *states, draw(0))
 
 
 def make_level(actor: dict | None = None, **kwargs: object) -> SACLevel:

@@ -157,46 +157,48 @@ def test_untimed_goals_come_from_the_same_window(strategy: str) -> None:
         SubgoalReplayBuffer(9, LAYOUT.low_space(), ENV.action_space, LAYOUT, RULES, 2, 0.9, 1, hindsight="final")
 
 
-def test_burn_in_recomputes_memory_through_the_window() -> None:
-    buffer = low_buffer(
-        100, hindsight=0, sequence_length=3, advance=lambda observations, states: 0.5 * states + observations[:, :1]
-    )
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+def test_samples_hold_the_steps_before_them_of_their_window() -> None:
+    buffer = low_buffer(100, hindsight=0, sequence_length=3)
+    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    buffer.extend(steps._replace(states=np.arange(5.0)[:, None] * np.ones((5, 2))))
+    batch = buffer.sample_burst(1, 200)
+    observations, earlier = batch.observations[0].numpy(), batch.earlier[0].view(200, 2, 1 + 5).numpy()
+    row = np.rint(observations[:, 0] / 0.1).astype(int)
+    before = np.array([0, 1, 2, 0, 1])[row]  # steps of the window that came before
+    np.testing.assert_array_equal(earlier[..., 0], np.stack([before >= 2, before >= 1], axis=1))
+    one, two = earlier[before >= 1, 1, 1:], earlier[before >= 2, 0, 1:]
+    np.testing.assert_allclose(one[:, 0], observations[before >= 1, 0] - 0.1, atol=1e-6)
+    np.testing.assert_allclose(two[:, 0], observations[before >= 2, 0] - 0.2, atol=1e-6)
+    np.testing.assert_array_equal(batch.states[0, :, 0].numpy(), row - before)  # memory at the first of these steps
+    assert (earlier[earlier[..., 0] == 0] == 0).all()
+
+
+def test_memory_begins_where_the_steps_do() -> None:
+    buffer = low_buffer(100, hindsight=0, sequence_length=2)
+    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    buffer.extend(steps._replace(states=np.arange(5.0)[:, None] * np.ones((5, 2))))
     batch = buffer.sample_burst(1, 200)
     row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
-    # state before row 2: 0.5 * (0.5 * 0 + position of row 0) + position of row 1; memory begins anew at row 3
-    before, after = np.array([0, 0, 0.1, 0, 0.3]), np.array([0, 0.1, 0.25, 0.3, 0.55])
-    np.testing.assert_allclose(batch.states[0, :, 0].numpy(), before[row], atol=1e-6)
-    np.testing.assert_allclose(batch.next_states[0, :, 1].numpy(), after[row], atol=1e-6)
+    np.testing.assert_array_equal(batch.states[0, :, 0].numpy(), np.array([0, 0, 1, 3, 3])[row])
 
 
-def test_without_burn_in_the_stored_states_are_sampled() -> None:
-    buffer = low_buffer(100, hindsight=0, advance=lambda observations, states: states + 10.0)
+def test_without_earlier_steps_the_stored_states_are_sampled() -> None:
+    buffer = low_buffer(100, hindsight=0)
     buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
     batch = buffer.sample_burst(1, 50)
     assert set(batch.states.unique().tolist()) == {0.0}
     assert set(batch.next_states.unique().tolist()) == {1.0}
+    assert batch.earlier.shape == (1, 50, 0)
 
 
-def test_burn_in_starts_from_the_stored_state_where_it_is_shorter_than_the_window() -> None:
-    steps = low_level_steps(episode(), ENV.subgoals, RULES)
-    buffer = low_buffer(100, hindsight=0, sequence_length=2, advance=lambda observations, states: states + 10.0)
-    buffer.extend(steps._replace(states=np.arange(5.0)[:, None] * np.ones((5, 2))))
-    batch = buffer.sample_burst(1, 200)
-    row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
-    np.testing.assert_allclose(batch.states[0, :, 0].numpy(), np.array([0, 10, 11, 3, 13])[row])
-
-
-def test_burn_in_sees_the_sampled_subgoal_and_its_time() -> None:
-    buffer = low_buffer(
-        100, hindsight=1e9, sequence_length=2, advance=lambda observations, states: observations[:, 3:5]
-    )
+def test_earlier_steps_have_the_sampled_subgoal_and_its_time() -> None:
+    buffer = low_buffer(100, hindsight=1e9, sequence_length=2)
     buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
     batch = buffer.sample_burst(1, 500)
-    observations, states = batch.observations[0].numpy(), batch.states[0].numpy()
-    later = ~np.isin(np.rint(observations[:, 0] / 0.1), [0, 3])  # not the first step of a window
-    np.testing.assert_allclose(states[later, 0], observations[later, 3])
-    np.testing.assert_allclose(states[later, 1], np.minimum(observations[later, 4] + 0.25, 1.0), atol=1e-6)
-    assert (states[~later] == 0).all()
-    with pytest.raises(ValueError, match="recomputes the low level's memory"):
+    observations, earlier = batch.observations[0].numpy(), batch.earlier[0].numpy()
+    known = earlier[:, 0] == 1
+    np.testing.assert_array_equal(known, ~np.isin(np.rint(observations[:, 0] / 0.1), [0, 3]))  # no first steps
+    np.testing.assert_allclose(earlier[known, 4], observations[known, 3])
+    np.testing.assert_allclose(earlier[known, 5], np.minimum(observations[known, 4] + 0.25, 1.0), atol=1e-6)
+    with pytest.raises(ValueError, match="unrolls the low level's memory"):
         SubgoalReplayBuffer(9, LAYOUT.low_space(), ENV.action_space, LAYOUT, RULES, 0, 0.9, 1, sequence_length=2)
