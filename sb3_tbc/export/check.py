@@ -20,6 +20,7 @@ from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import Circuit, ExportedPolicy, action_box
 from sb3_tbc.extras import require
+from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.environments import make_env
@@ -326,10 +327,15 @@ def cortex_m4(path: Path) -> Cortex | None:
 
 
 def cortex_m4_report(path: Path) -> str:
-    """The sizes as one line."""
-    size = cortex_m4(path)
+    """The sizes as one line, or why they were not measured."""
+    advice = "Debian: apt install gcc-arm-none-eabi libnewlib-arm-none-eabi"
+    try:
+        size = cortex_m4(path)
+    except (OSError, subprocess.CalledProcessError) as error:  # a compiler without its library, for example
+        said = error.stderr.decode(errors="replace") if isinstance(error, subprocess.CalledProcessError) else str(error)
+        return f"Cortex-M4 size: not measured (the compiler failed: {one_line(said)}; {advice})"
     if size is None:
-        return "Cortex-M4 size: not measured (arm-none-eabi-gcc not found; Debian: apt install gcc-arm-none-eabi)"
+        return f"Cortex-M4 size: not measured (arm-none-eabi-gcc not found; {advice})"
     return (
         f"Cortex-M4, low level in single precision: {size.flash} bytes of flash, {size.library} more for the "
         f"mathematical library; RAM {size.state} bytes of state and at most {size.stack} of stack"
@@ -354,8 +360,8 @@ def _linked(run: list[str], folder: Path, source: Path) -> int:
 
 def _sections(path: Path) -> tuple[int, int, int]:
     """Bytes of text, data and bss."""
-    output = subprocess.run(["arm-none-eabi-size", str(path)], check=True, capture_output=True, text=True).stdout
-    text, data, bss = output.splitlines()[1].split()[:3]
+    output = subprocess.run(["arm-none-eabi-size", str(path)], check=True, capture_output=True).stdout
+    text, data, bss = output.decode().splitlines()[1].split()[:3]
     return int(text), int(data), int(bss)
 
 

@@ -26,6 +26,7 @@ from sb3_tbc.export.check import (
     compare,
     compare_closed_form,
     cortex_m4,
+    cortex_m4_report,
     player,
 )
 from sb3_tbc.export.policy import Circuit, ExportedPolicy, _Probe, extract
@@ -253,6 +254,18 @@ def test_the_largest_low_level_fits_a_microcontroller(tmp_path: Path) -> None:
     assert size is not None
     assert size.flash + size.library < 16 * 1024
     assert size.stack + size.state < 2 * 1024
+
+
+def test_a_compiler_that_fails_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler = tmp_path / "arm-none-eabi-gcc"
+    compiler.write_text("#!/bin/sh\necho 'math.h: no such file' >&2\nexit 1\n")
+    compiler.chmod(0o755)
+    (tmp_path / "policy.c").write_text("int x;")
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
+    report = cortex_m4_report(tmp_path / "policy.c")
+    assert "not measured (the compiler failed: math.h: no such file; Debian: apt install" in report
+    monkeypatch.setenv("PATH", "")
+    assert "not measured (arm-none-eabi-gcc not found; Debian" in cortex_m4_report(tmp_path / "policy.c")
 
 
 def test_a_closed_form_unlike_the_agent_draws_a_warning(tmp_path: Path) -> None:
