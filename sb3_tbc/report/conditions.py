@@ -24,7 +24,8 @@ def _high_updates(run: Run) -> object:
 
 def _averaging(run: Run) -> str:
     decays = [_level(run, level, "average_decay") for level in ("high", "low")]
-    return "default" if decays == [None, None] else " and ".join(str(decay) for decay in decays)
+    said = ["default" if decay is None else str(decay) for decay in decays]
+    return said[0] if said == ["default", "default"] else " and ".join(said)
 
 
 def _subgoal_view(run: Run) -> str | None:

@@ -36,3 +36,31 @@ def fake_run(
     counts = {"n_episodes": 100, "n_timesteps": 4000, "wall_time": 120.0, "eval_seed": 2_000_000 + 1000 * seed}
     folder.finish({**identity, **counts, **rest, "worst_after_first_90": None, **final})
     return folder
+
+
+def small_ledger(root: Path) -> None:
+    """A few runs of all kinds: equal and unequal conditions, ties, failures, constant rows, variants and ablations."""
+    equal = {"model": {"high": {"average_decay": 0.999}, "low": {"average_decay": 0.999}}, "n_timesteps": 4000}
+    slower = {"model": {"high": {"gradient_ratio": 0.5, "average_decay": 0.999}, "gradient_ratio": 2.0}}
+    paper = {**equal, "model": {**equal["model"], "target": "decision", "memory": None}}  # type: ignore[dict-item]
+    for seed, rate in enumerate((1.0, 0.97, 0.95), 100):
+        outcomes = "".join("0" if i % 33 == 0 and rate < 1 else "1" for i in range(100))
+        fake_run(root, "Pendulum", "tbc-hrl", seed, rate, config=equal, outcomes=outcomes)
+        fake_run(
+            root, "Pendulum", "hits", seed, 0.9 * rate, config=equal, commit="0123abcd+" if seed == 101 else "0123abcd"
+        )
+        fake_run(root, "Pendulum", "tbc-hrl", seed, 0.5, variant="no-ndbc", config=equal, curve=[0.1, 0.5, 0.95, 0.5])
+        fake_run(root, "Drawbridge", "tbc-hrl", seed, 1.0, config=equal, stable_share=0.75)
+        fake_run(root, "Drawbridge", "hits", seed, 1.0, config=slower, curve=[1.0, 1.0, 1.0, 1.0])
+    for seed in (100, 101):
+        fake_run(root, "Pendulum", "sac", seed, 0.0, config={**slower, "n_envs": 4}, mean_length_success=None)
+        fake_run(root, "Drawbridge", "hac", seed, 0.25, outcomes="0001" * 25, wall_time=None)
+        fake_run(root, "Drawbridge", "tbc-hrl", seed, 0.75, variant="another", config=paper, outcomes="0111" * 25)
+    fake_run(root, "Pendulum", "tbc-hrl", 7, 0.5, variant="full-paper", config=paper, n_timesteps=2000)
+    failed = root / "Drawbridge" / "sac" / "full" / "seed_100"
+    failed.mkdir(parents=True)
+    (failed / "failed.json").write_text("{}")
+    (root / "descriptions.yml").write_text("Pendulum:\n  tbc-hrl: as it is | shipped\n")
+    (root / "tuning_seeds.yml").write_text("Drawbridge:\n  hits: [100, 101, 102]\n")
+    rows = "  - {task: Pendulum, seeds: 4, methods: [tbc-hrl, hac]}\n"
+    (root / "campaign.yml").write_text(f"first_seed: 100\noptions: [--n-eval-episodes, '10']\nruns:\n{rows}")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from made_up_runs import fake_run
+from made_up_runs import fake_run, small_ledger
 
 from sb3_tbc.report import command as report
 from sb3_tbc.report.curves import Style, figure, label_places, tick_distance
@@ -214,3 +214,18 @@ def test_the_committed_pages_are_what_the_ledger_gives(tmp_path: Path) -> None:
     assert page.read_text() == committed.read_text(), "run `make report`"
     assert measured.read_text() == (ROOT / "sb3_tbc" / "zoo" / "measured.yml").read_text(), "run `make report`"
     assert html.read_text() == (ROOT / "docs" / "_static" / "report.html").read_text(), "run `make report`"
+
+
+@pytest.mark.parametrize("form", ["printed", "page"])
+def test_a_small_ledger_gives_these_tables(form: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every word and figure of the report, so that none changes unnoticed."""
+    known = ROOT / "tests" / "data" / f"small_report_{form}.md"
+    small_ledger(tmp_path / "ledger")
+    page = tmp_path / "page.md"
+    page.write_text("<!-- results:begin -->\n<!-- results:end -->\n")
+    assert report.main([str(tmp_path / "ledger"), "--update", str(page)]) == 0
+    text = capsys.readouterr().out if form == "printed" else page.read_text(encoding="utf-8")
+    text = text.replace(str(tmp_path), "TMP")
+    text = re.sub(r"(?s)## Where the shipped agent departs.*?(?=## )", "", text)  # these are the shipped settings' own
+    (tmp_path / "now.md").write_text(text, encoding="utf-8")
+    assert text == known.read_text(encoding="utf-8"), f"if this is meant: cp {tmp_path / 'now.md'} {known}"
