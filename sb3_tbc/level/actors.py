@@ -7,6 +7,7 @@ as a function of those blocks, which is what the update differentiates.
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
@@ -33,6 +34,11 @@ WIRING_KEYS = (
 )  # fmt: skip
 
 
+SQUASH_EPSILON = 1e-6
+"""Added inside the logarithm of tanh's derivative, as SB3 does."""
+HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
+
+
 class GaussianHead:
     """Bounds of a squashed Gaussian's parameters before squashing.
 
@@ -55,6 +61,15 @@ class GaussianHead:
         if self.mean_bound is not None:
             mean = mean.clamp(-self.mean_bound, self.mean_bound)
         return mean, log_std.clamp(*self.log_std_bounds)
+
+
+def squash(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    """Squashed Gaussian sample ``(batch, action_dim)`` and its log-probability ``(batch, 1)``, from given noise."""
+    # u = mean + std * noise, a = tanh(u); log pi(a) = log N(u; mean, std) - sum log(1 - tanh(u)^2)
+    # (appendix C of arXiv 1801.01290). With u standardised, log N is a function of the noise alone.
+    actions = th.tanh(mean + log_std.exp() * noise)
+    log_prob = -0.5 * noise.square() - log_std - HALF_LOG_TAU - th.log(1 - actions.square() + SQUASH_EPSILON)
+    return actions, log_prob.sum(dim=-1, keepdim=True)
 
 
 class MLPActor(Actor):

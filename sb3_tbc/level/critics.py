@@ -18,6 +18,23 @@ NORM_EPSILON = 1e-5
 """Added to variances before their root is taken, as torch's normalisations do."""
 BATCH_MOMENTUM = 0.01
 """Share of the newest batch in the running statistics of batch normalisation, as in CrossQ (arXiv 1902.05605)."""
+ACTOR_Q = {"min": 0.0, "max": 1.0, "mean": None}
+"""Values of ``actor_q`` that have a name; the mean is over all critics, even if there are more than two."""
+
+
+def optimism_of(actor_q: str | float) -> float | None:
+    """Where between the smallest (0) and the largest (1) critic the actor's value lies; None for the mean.
+
+    :raises ValueError: for another value of ``actor_q``
+    """
+    if isinstance(actor_q, str) and actor_q in ACTOR_Q:
+        return ACTOR_Q[actor_q]
+    if isinstance(actor_q, int | float) and not isinstance(actor_q, bool) and 0.0 <= actor_q <= 1.0:
+        return float(actor_q)
+    raise ValueError(
+        f"actor_q must be 'min', 'mean', 'max' or a number from 0 (the smallest critic) to 1 (the largest), got "
+        f"{actor_q!r}"
+    )
 
 
 class LevelCritic(ContinuousCritic):

@@ -23,8 +23,9 @@ import torch as th
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_leaves, tree_unflatten
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.level.actors import squash
 from sb3_tbc.level.compilation import compile_step
-from sb3_tbc.level.critics import BATCH_MOMENTUM
+from sb3_tbc.level.critics import BATCH_MOMENTUM, optimism_of
 from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.level.step_inputs import Given, LearntState, Moments, Schedules, StepInputs
 from sb3_tbc.level.storage import FlatParameters, flat_adam
@@ -35,37 +36,8 @@ DIAGNOSTICS = ("critic_loss", "actor_loss", "ent_coef_loss", "ent_coef", "q_mean
 """Quantities whose mean is logged; ``target_clipped`` is the share of targets that were moved to a bound."""
 EXTREMES: dict[str, Callable[[float, float], float]] = {"target_min": min, "target_max": max}
 """The lowest and the highest target of the critics, which are logged as well."""
-ACTOR_Q = {"min": 0.0, "max": 1.0, "mean": None}
-"""Values of ``actor_q`` that have a name; the mean is over all critics, even if there are more than two."""
 AVERAGE_DECAY = 0.999
 """Default decay per update of the averaged actor; in the n-th update at most (1 + n) / (10 + n)."""
-SQUASH_EPSILON = 1e-6
-"""Added inside the logarithm of tanh's derivative, as SB3 does."""
-HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
-
-
-def squash(mean: th.Tensor, log_std: th.Tensor, noise: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-    """Squashed Gaussian sample ``(batch, action_dim)`` and its log-probability ``(batch, 1)``, from given noise."""
-    # u = mean + std * noise, a = tanh(u); log pi(a) = log N(u; mean, std) - sum log(1 - tanh(u)^2)
-    # (appendix C of arXiv 1801.01290). With u standardised, log N is a function of the noise alone.
-    actions = th.tanh(mean + log_std.exp() * noise)
-    log_prob = -0.5 * noise.square() - log_std - HALF_LOG_TAU - th.log(1 - actions.square() + SQUASH_EPSILON)
-    return actions, log_prob.sum(dim=-1, keepdim=True)
-
-
-def optimism_of(actor_q: str | float) -> float | None:
-    """Where between the smallest (0) and the largest (1) critic the actor's value lies; None for the mean.
-
-    :raises ValueError: for another value of ``actor_q``
-    """
-    if isinstance(actor_q, str) and actor_q in ACTOR_Q:
-        return ACTOR_Q[actor_q]
-    if isinstance(actor_q, int | float) and not isinstance(actor_q, bool) and 0.0 <= actor_q <= 1.0:
-        return float(actor_q)
-    raise ValueError(
-        f"actor_q must be 'min', 'mean', 'max' or a number from 0 (the smallest critic) to 1 (the largest), got "
-        f"{actor_q!r}"
-    )
 
 
 class SACUpdate:

@@ -24,10 +24,11 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from torch.utils._pytree import tree_leaves
 
 from sb3_tbc.level import compilation
+from sb3_tbc.level.actors import squash
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.spaces_only import SpacesOnlyVecEnv
 from sb3_tbc.level.storage import FlatParameters
-from sb3_tbc.level.update import Given, squash
+from sb3_tbc.level.update import Given
 from sb3_tbc.replay.batch import LevelBatch
 
 
