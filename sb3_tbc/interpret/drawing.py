@@ -71,7 +71,7 @@ def _sensory(numbers: Circuit, u: FloatArray, v: FloatArray) -> FloatArray:
     driven = len(numbers.current_bias)
     pulls = scaled @ numbers.current_weight + numbers.current_bias
     ratio = np.divide(np.tanh(pulls), pulls, out=np.ones_like(pulls), where=np.abs(pulls) > 1e-6)
-    gain = np.array([numbers.from_inputs[n_sensing + j, n + j] for j in range(driven)])
+    gain = np.array([numbers.from_inputs[n_sensing + j, j] for j in range(driven)])
     current[:, :, :driven] += (gain * ratio)[:, None, :] * scaled[:, :, None] * numbers.current_weight
     return np.asarray(np.abs(current).mean(axis=0))
 

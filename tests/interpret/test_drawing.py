@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+import torch as th
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.interpret.drawing import draw_agent, mean_currents, picture_of
 from sb3_tbc.interpret.episodes import Trace
 from sb3_tbc.interpret.names import action_names, input_names
 from sb3_tbc.interpret.units import CircuitUnits
+from sb3_tbc.ndbc.network import SYNAPSES, NDBCNet
+from sb3_tbc.ndbc.wiring import NDBCWiring
 from sb3_tbc.pretrained import load_pretrained, pretrained_names
 
 
@@ -33,6 +38,23 @@ def test_a_synapse_that_is_not_there_carries_nothing(units: CircuitUnits, traces
     cut = units.without_synapse(0)
     i, j = np.argwhere(wiring.sensory)[0]
     assert mean_currents(cut, 1, traces)[0][i, j] == 0.0
+
+
+@pytest.mark.parametrize("synapses", SYNAPSES)
+def test_input_currents_are_those_of_the_cell(synapses: str) -> None:
+    wiring = NDBCWiring(1, 3, 2, 1, 3, 2, 1, 1, seed=0)
+    net = NDBCNet(1, 2, wiring, seed=0, synapses=synapses)
+    with th.no_grad():
+        net.cell.current_bias.zero_()
+        if synapses == "paper":
+            net.cell.raw_conductance.fill_(-th.inf)  # its sensory synapses conduct besides
+    u = np.array([[0.5], [-0.8]], np.float32)
+    units = SimpleNamespace(net=net)
+    trace = SimpleNamespace(inputs=u, activations=np.zeros((2, net.state_dim), np.float32))
+    found, _ = mean_currents(units, 1, [trace])  # type: ignore[arg-type, list-item]
+    size = net.cell.values().input_conductance.detach().numpy()
+    expected = size * np.abs(np.tanh(u @ net.cell.arrays().current_weight.detach().numpy())).mean(axis=0)
+    np.testing.assert_allclose(found[0, : len(expected)], expected, rtol=1e-5)
 
 
 def test_the_picture(agent: TBCHRL, units: CircuitUnits, traces: list[Trace]) -> None:
