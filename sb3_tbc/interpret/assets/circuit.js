@@ -69,7 +69,7 @@ class ConductanceCircuit {
       if (from >= 0) return released[from] * (this.recurrent[from][j] - this.recurrent[from][n + j] * v[j]);
       const i = -1 - from;
       let current = i < sensing ? sensed[i] * (this.from_inputs[i][j] - this.from_inputs[i][n + j] * v[j]) : 0;
-      if (j < this.driven) current += this.from_inputs[sensing + j][n + j] * ratio[j] * scaled[i] * this.current_weight[i][j];
+      if (j < this.driven) current += this.from_inputs[sensing + j][j] * ratio[j] * scaled[i] * this.current_weight[i][j];
       return current;
     });
   }
