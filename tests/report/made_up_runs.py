@@ -40,23 +40,27 @@ def fake_run(
 
 def small_ledger(root: Path) -> None:
     """A few runs of all kinds: equal and unequal conditions, ties, failures, constant rows, variants and ablations."""
-    equal = {"model": {"high": {"average_decay": 0.999}, "low": {"average_decay": 0.999}}, "n_timesteps": 4000}
+    levels = {"high": {"average_decay": 0.999, "gradient_ratio": 0.25}, "low": {"average_decay": 0.999}}
+    equal = {"model": levels, "n_timesteps": 4000}
     slower = {"model": {"high": {"gradient_ratio": 0.5, "average_decay": 0.999}, "gradient_ratio": 2.0}}
-    paper = {**equal, "model": {**equal["model"], "target": "decision", "memory": None}}  # type: ignore[dict-item]
+    paper = {**equal, "model": {**levels, "target": "decision", "memory": None}}
     for seed, rate in enumerate((1.0, 0.97, 0.95), 100):
         outcomes = "".join("0" if i % 33 == 0 and rate < 1 else "1" for i in range(100))
-        fake_run(root, "Pendulum", "tbc-hrl", seed, rate, config=equal, outcomes=outcomes)
-        fake_run(
-            root, "Pendulum", "hits", seed, 0.9 * rate, config=equal, commit="0123abcd+" if seed == 101 else "0123abcd"
-        )
+        quick = [0.5, 0.95, rate, rate]
+        fake_run(root, "Pendulum", "tbc-hrl", seed, rate, config=equal, outcomes=outcomes, curve=quick)
+        fake_run(root, "Pendulum", "hits", seed, 0.9 * rate, config=equal, commit="0123abcd" + "+" * (seed == 101))
         fake_run(root, "Pendulum", "tbc-hrl", seed, 0.5, variant="no-ndbc", config=equal, curve=[0.1, 0.5, 0.95, 0.5])
-        fake_run(root, "Drawbridge", "tbc-hrl", seed, 1.0, config=equal, stable_share=0.75)
+        fake_run(root, "Drawbridge", "tbc-hrl", seed, 1.0, config=equal, stable_share=0.75, outcomes="1" * 100)
         fake_run(root, "Drawbridge", "hits", seed, 1.0, config=slower, curve=[1.0, 1.0, 1.0, 1.0])
+        fake_run(root, "Platforms", "tbc-hrl", seed, 0.2, config=equal)
+        fake_run(root, "Platforms", "hits", seed, 0.1, config=equal)
     for seed in (100, 101):
         fake_run(root, "Pendulum", "sac", seed, 0.0, config={**slower, "n_envs": 4}, mean_length_success=None)
-        fake_run(root, "Drawbridge", "hac", seed, 0.25, outcomes="0001" * 25, wall_time=None)
-        fake_run(root, "Drawbridge", "tbc-hrl", seed, 0.75, variant="another", config=paper, outcomes="0111" * 25)
-    fake_run(root, "Pendulum", "tbc-hrl", 7, 0.5, variant="full-paper", config=paper, n_timesteps=2000)
+        fake_run(root, "Drawbridge", "hac", seed, 0.25, outcomes="0001" * 25, wall_time=None, commit="0123abcd+")
+        steps = {"n_timesteps": 40 * seed, "outcomes": "0111" * 25}
+        fake_run(root, "Drawbridge", "tbc-hrl", seed, 0.75, variant="another", config=paper, **steps)
+    unknown = fake_run(root, "Pendulum", "tbc-hrl", 7, 0.5, variant="full-paper", config=paper, n_episodes=0)
+    (unknown.path / "versions.json").unlink()
     failed = root / "Drawbridge" / "sac" / "full" / "seed_100"
     failed.mkdir(parents=True)
     (failed / "failed.json").write_text("{}")
