@@ -347,3 +347,15 @@ def test_every_committed_row_has_a_description() -> None:
     assert missing == []
     assert describe(descriptions, "Nowhere", "tbc-hrl no-ts").startswith("ablation")
     assert describe(descriptions, "Nowhere", "tbc-hrl unheard-of") == ""
+
+
+def test_episodes_pair_by_the_seed_they_were_evaluated_on(tmp_path: Path) -> None:
+    """Outcomes that are opposite half by half: blocks of pairs differ more than two rows that are taken apart."""
+    fake_run(tmp_path, "A", "tbc-hrl", 100, 0.5, outcomes="1" * 50 + "0" * 50)
+    fake_run(tmp_path, "A", "hits", 100, 0.5, outcomes="0" * 50 + "1" * 50)
+    fake_run(tmp_path, "A", "hac", 100, 0.5, outcomes="0" * 50 + "1" * 50, eval_seed=7)
+    methods = load_results(tmp_path)["A"]
+    paired, apart = (difference_of(methods["tbc-hrl"], methods[other]) for other in ("hits", "hac"))
+    assert paired.mean == apart.mean == 0.0
+    assert paired.low < apart.low - 0.1
+    assert paired.high > apart.high + 0.1
