@@ -51,7 +51,7 @@ def test_input_currents_are_those_of_the_cell(synapses: str) -> None:
     u = np.array([[0.5], [-0.8]], np.float32)
     units = SimpleNamespace(net=net)
     trace = SimpleNamespace(inputs=u, activations=np.zeros((2, net.state_dim), np.float32))
-    found, _ = mean_currents(units, 1, [trace])  # type: ignore[arg-type, list-item]
+    found, _ = mean_currents(units, 1, [trace])
     size = net.cell.values().input_conductance.detach().numpy()
     expected = size * np.abs(np.tanh(u @ net.cell.arrays().current_weight.detach().numpy())).mean(axis=0)
     np.testing.assert_allclose(found[0, : len(expected)], expected, rtol=1e-5)
