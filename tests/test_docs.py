@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import json
 import re
 import subprocess
 import sys
@@ -11,11 +10,12 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-import yaml
 
 from sb3_tbc.commands import COMMANDS
+from sb3_tbc.report.runs import Results, load_results
 
 ROOT = Path(__file__).parents[1]
+TASKS = ("Pendulum", "UR5Reacher", "Drawbridge", "AntFourRooms", "Tennis2D", "Platforms")
 DERIVED = {"commands.md", "settings.md"}  # written when the pages are built
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in DERIVED)]
 NOTES = sorted((ROOT / "results" / "notes").glob("*.md"))
@@ -56,19 +56,23 @@ def test_the_package_index_page_has_no_relative_links() -> None:
     assert not [t for t in re.findall(r"\]\(([^)]+)\)", text) if not t.startswith("http")]
 
 
-ROWS = {"Pendulum": "hits", "UR5Reacher": "hits", "Drawbridge": "hits", "AntFourRooms": "hits", "Tennis2D": "hits"}
+@pytest.fixture(scope="module")
+def ledger() -> Results:
+    return load_results(ROOT / "results")
 
 
-@pytest.mark.parametrize("task", [*ROWS, "Platforms"])
-def test_readmes_results_are_the_ledgers(task: str) -> None:
+@pytest.mark.parametrize("method", ["tbc-hrl", "hits"])
+@pytest.mark.parametrize("task", TASKS)
+def test_readmes_results_are_the_ledgers(ledger: Results, task: str, method: str) -> None:
     row = next(line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith(f"| {task}"))
-    tuned = yaml.safe_load((ROOT / "results" / "tuning_seeds.yml").read_text())[task]["tbc-hrl"]
-    finals = [json.loads(p.read_text()) for p in (ROOT / "results" / task / "tbc-hrl" / "full").glob("*/final.json")]
-    finals = [final for final in finals if final["seed"] not in tuned] or finals
-    mean = sum(final["success_rate"] for final in finals) / len(finals)
-    said = re.findall(r"(?<![\d.])(1\.00|\.\d\d)", row)[0]
-    assert float(said) == round(mean, 2)
-    assert f"| {len(finals)} |" in row
+    success, seeds = row.split("|")[2:4] if method == "tbc-hrl" else row.split("|")[5:7]
+    runs = [run.final for run in ledger[task][method]]
+    said = re.findall(r"(?<![\d.])(1\.00|\.\d\d)", success)[0]
+    assert float(said) == round(sum(run["success_rate"] for run in runs) / len(runs), 2)
+    assert int(seeds) == len(runs)
+    if "steps" in success:
+        lengths = [run["mean_length_success"] for run in runs if run["mean_length_success"] is not None]
+        assert f"({sum(lengths) / len(lengths):.0f} steps)" in success
 
 
 @pytest.mark.slow

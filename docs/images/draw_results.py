@@ -1,15 +1,16 @@
 """Draw docs/images/success.svg from the results ledger: ``python docs/images/draw_results.py`` from the checkout.
 
 Success of the shipped settings, of HiTS in this code, and of the paper (its table 2) on the six tasks. Our runs are the
-ledger's variant ``full``, mean over seeds; the number of seeds stands beside each point.
+ledger's variant ``full``, mean over the seeds that the report shows.
 """
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import yaml
+
+from sb3_tbc.report.runs import Results, load_results
 
 ROOT = Path(__file__).parents[2]
 TASKS = ("Pendulum", "UR5Reacher", "Drawbridge", "Platforms", "AntFourRooms", "Tennis2D")
@@ -22,13 +23,10 @@ LEFT, RIGHT, TOP, ROW = 130, 40, 46, 44
 WIDTH = 760
 
 
-def ours(task: str, algo: str) -> tuple[float, int, int] | None:
-    """Mean final success, number of seeds and environment steps; None without a run."""
-    finals = [json.loads(p.read_text()) for p in (ROOT / "results" / task / algo / "full").glob("seed_*/final.json")]
-    if not finals:
-        return None
-    rates = [final["success_rate"] for final in finals]
-    return sum(rates) / len(rates), len(rates), max(final["n_timesteps"] for final in finals)
+def ours(results: Results, task: str, algo: str) -> float | None:
+    """Mean final success; None without a run."""
+    rates = [run.final["success_rate"] for run in results[task].get(algo, [])]
+    return sum(rates) / len(rates) if rates else None
 
 
 def paper(task: str) -> float:
@@ -49,6 +47,7 @@ def mark(kind: str, x: float, y: float, colour: str) -> str:
 
 def draw() -> str:
     """The picture."""
+    results = load_results(ROOT / "results")
     height = TOP + ROW * len(TASKS) + 34
     scale = WIDTH - LEFT - RIGHT
     parts = [
@@ -71,9 +70,9 @@ def draw() -> str:
         parts.append(f'<path d="M{LEFT} {y:.1f}H{WIDTH - RIGHT}" stroke="#eee"/>')
         parts.append(mark("bar", LEFT + scale * paper(task), y, SERIES[2][1]))
         for algo, (_, colour, kind), shift in (("hits", SERIES[1], 7), ("tbc-hrl", SERIES[0], -7)):
-            found = ours(task, algo)
-            if found is not None:
-                parts.append(mark(kind, LEFT + scale * found[0], y + shift, colour))
+            success = ours(results, task, algo)
+            if success is not None:
+                parts.append(mark(kind, LEFT + scale * success, y + shift, colour))
     return "\n".join([*parts, "</svg>"]) + "\n"
 
 
