@@ -55,7 +55,7 @@ def parse_yaml(text: str, what: str) -> Any:
     """
 
     def parse() -> Any:
-        loader = yaml.SafeLoader(text)
+        loader = yaml.SafeLoader(text)  # not the parser in C, which crashes on deep nesting
         try:
             node = loader.get_single_node()
             if node is None:
