@@ -66,6 +66,10 @@ class TwoLevelActor:
         """
         return self.low.act(observations, membrane, deterministic, rng, average=deterministic is True)
 
+    def carried(self, membrane: FloatArray) -> FloatArray:
+        """What the next step of the same option begins with: the memory, or rest with ``memory: none``."""
+        return np.zeros(membrane.shape, dtype=np.float32) if self.memory == "none" else membrane
+
     def forget(self, membrane: FloatArray, window_over: BoolArray, episode_over: BoolArray) -> FloatArray:
         """The memory with which the next step begins: blank where it ends.
 
@@ -73,9 +77,7 @@ class TwoLevelActor:
         :param window_over: whose option ended with it
         :param episode_over: whose episode ended with it
         """
-        if not membrane.shape[1]:
-            return membrane
-        if self.memory == "none":
-            return np.zeros(membrane.shape, dtype=np.float32)
+        if self.memory == "none" or not membrane.shape[1]:
+            return self.carried(membrane)
         over = window_over if self.memory == "window" else episode_over
         return np.where(over[:, None], np.float32(0.0), membrane) if np.count_nonzero(over) else membrane

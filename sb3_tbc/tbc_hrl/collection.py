@@ -89,7 +89,7 @@ class TwoLevelRunner:
         """One step of every environment."""
         before = self.membrane
         unit, after = self.act()
-        step = self.env.advance(unit, before, after)
+        step = self.env.advance(unit, before, self.actor.carried(after))
         self.observation = step.observations
         self.membrane = self.actor.forget(after, step.window_over, step.episode_over)
         return step

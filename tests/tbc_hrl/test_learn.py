@@ -248,3 +248,16 @@ def test_what_cannot_be_meant_is_refused() -> None:
         with pytest.raises(error, match=words):
             model.learn(steps)  # type: ignore[arg-type]
     assert model.learn(40.0).num_timesteps == 40  # type: ignore[arg-type]
+
+
+CIRCUIT = {"ndbc": {"inter": 4, "command": 3, "motor": 1, "sensory_fanout": 2, "inter_fanout": 2, "motor_fanin": 2}}
+
+
+@pytest.mark.parametrize("memory", ["none", "window"])
+def test_the_state_after_a_step_is_what_the_next_step_begins_with(memory: str) -> None:
+    """Else the critics' target would use actions of a policy that never acts."""
+    low = {**LEVEL, "policy_kwargs": {"net_arch": [8, 8], **CIRCUIT}}
+    data = make(low=low, memory=memory).learn(60).replay_buffer.low.data
+    assert bool(np.abs(data["next_states"][:30]).max()) == (memory == "window")
+    goes_on = ~data["dones"][:29].astype(bool).ravel() & data["states"][1:30].any(axis=-1).ravel()
+    np.testing.assert_array_equal(data["next_states"][:29][goes_on], data["states"][1:30][goes_on])
