@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -17,8 +18,9 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json, read_text, read_yaml
 from sb3_tbc.report.checked import check_final, check_sections
 from sb3_tbc.zoo.callbacks import EvaluationRow
-from sb3_tbc.zoo.config import OF_PAPER
+from sb3_tbc.zoo.config import OF_PAPER, merge
 from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
+from sb3_tbc.zoo.schema import CONFIG_CLASSES
 
 OURS = "tbc-hrl"
 SHIPPED = "full"
@@ -54,6 +56,11 @@ class Run(NamedTuple):
         return algo if variant == SHIPPED else f"{algo} {variant}"
 
     @property
+    def settings(self) -> Plain:
+        """Settings of the agent, with the defaults of those that the run did not give."""
+        return with_defaults(str(self.final["algo"]), self.config.get("model") or {})
+
+    @property
     def curve(self) -> Curve:
         """Success rate against steps."""
         return Curve([row.timesteps for row in self.rows], [row.success_rate for row in self.rows])
@@ -83,6 +90,16 @@ class Run(NamedTuple):
     def dirty(self) -> bool:
         """Whether the commit does not determine the code."""
         return self.commit.endswith("+") or self.commit == "unknown"
+
+
+def with_defaults(algo: str, model: PlainMapping) -> Plain:
+    """Settings with the defaults of those that are not given. They are not checked: names may have gone since."""
+    return merge(_defaults(algo), {name: value for name, value in model.items() if name != "policy"})
+
+
+@cache
+def _defaults(algo: str) -> Plain:
+    return CONFIG_CLASSES[algo]().to_dict() if algo in CONFIG_CLASSES else {}
 
 
 Results = dict[str, dict[str, list[Run]]]

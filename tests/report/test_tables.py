@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from sb3_tbc.report.paper import load_paper
 from sb3_tbc.report.planned import missing_table
 from sb3_tbc.report.runs import Curve, describe, load_descriptions, load_results, on_union_of_steps
 from sb3_tbc.reproduce import jobs
+from sb3_tbc.zoo.config import load_config, merge
 
 ROOT = Path(__file__).parents[2]
 
@@ -160,7 +162,8 @@ def test_unequal_conditions_are_named(tmp_path: Path) -> None:
     for seed in range(2):
         fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, config=ours)
         fake_run(tmp_path, "A", "hits", seed, 1.0, config=theirs)
-        fake_run(tmp_path, "A", "sac", seed, 1.0, config={**ours, "model": {"gradient_ratio": 0.25}})
+        equal = {**ours, "model": {"gradient_ratio": 0.25, "average_decay": 0.999}}
+        fake_run(tmp_path, "A", "sac", seed, 1.0, config=equal)
     results = load_results(tmp_path)
     assert unequal_conditions(results) == {
         "A": {
@@ -173,6 +176,35 @@ def test_unequal_conditions_are_named(tmp_path: Path) -> None:
         }
     }
     assert tables.conditions_table(results)[1][:2] == ["A", "hits"]
+
+
+def test_defaults_are_compared_as_the_values_they_stand_for(tmp_path: Path) -> None:
+    levels = {"high": {"average_decay": 0.999}, "low": {"average_decay": 0.999, "gone_since": 3}, "gradient_ratio": 1}
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0, config={"model": levels})
+    fake_run(tmp_path, "A", "hits", 0, 1.0, config={"model": {"high": {"gradient_ratio": 0.5}}})
+    fake_run(tmp_path, "A", "hac", 0, 1.0, config={"model": {}})
+    fake_run(tmp_path, "A", "sac", 0, 1.0, config={"model": {}})
+    assert unequal_conditions(load_results(tmp_path))["A"] == {
+        "hits": ["updates per step: 0.5 high and 1.0 low (1.0)"],
+        "sac": ["weight averaging: 0.0 (0.999)"],
+    }
+
+
+def test_rows_say_whose_settings_they_do_not_have(tmp_path: Path) -> None:
+    model = load_config("tbc-hrl", "Pendulum").model
+    other = {**model, "kappa": 9.0, "dt_min": 7, "reconsider_margin": 3.0, "fixed_duration": 5.0}
+    for variant, settings in (("full", [model, model]), ("others", [model, {**model, "kappa": 9.0}])):
+        for seed, given in enumerate(settings):
+            fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0, variant, config={"model": given})
+    for task in ("Drawbridge", "Foreign"):
+        given = {**load_config("sac", "Drawbridge").model, "tau": 0.5}
+        fake_run(tmp_path, task, "sac", 0, 1.0, config={"model": given})
+    fake_run(tmp_path, "UR5Reacher", "tbc-hrl", 0, 1.0, config={"model": merge(model, other)})
+    notes = {(t, m): notes_of_row(runs, rows) for t, rows in load_results(tmp_path).items() for m, runs in rows.items()}
+    assert notes["Pendulum", "tbc-hrl"] == notes["Foreign", "sac"] == []
+    assert notes["Pendulum", "tbc-hrl others"] == ["settings differ between seeds: kappa"]
+    assert notes["Drawbridge", "sac"][0] == "not the shipped settings: tau"
+    assert re.fullmatch(r"not the shipped settings: \w+, \w+, \w+ and \d+ more", notes["UR5Reacher", "tbc-hrl"][0])
 
 
 def test_comparisons_say_what_is_unequal_in_ablations_too(tmp_path: Path) -> None:
