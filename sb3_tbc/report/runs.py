@@ -111,7 +111,7 @@ def load_results(root: Path) -> Results:
 
     Seeds on which settings were chosen are left out if their row has other seeds, because they would bias it.
 
-    :raises ConfigError: if there is no run, or one cannot be read
+    :raises ConfigError: if there is no run, or one or the table of these seeds cannot be read
     """
     results: Results = defaultdict(lambda: defaultdict(list))
     for folder in finished_runs(root):
@@ -122,16 +122,23 @@ def load_results(root: Path) -> Results:
             raise ConfigError(f"cannot read the run in {folder.path}: {error}") from error
     if not results:
         raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
-    tuned = read_table(root / TUNING_SEEDS)
+    tuned = _tuning_seeds(root / TUNING_SEEDS)
     return {
-        task: {m: _reported(methods[m], tuned.get(task, {}).get(m, ())) for m in sorted(methods, key=_rank)}
+        task: {m: _reported(methods[m], tuned.get((task, m), ())) for m in sorted(methods, key=_rank)}
         for task, methods in sorted(results.items())
     }
 
 
-def _reported(runs: Sequence[Run], tuned_on: Iterable[int]) -> list[Run]:
+def _tuning_seeds(path: Path) -> dict[tuple[str, str], list[int]]:
+    for task, rows in (table := read_table(path)).items():
+        for method, seeds in rows.items():
+            if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
+                raise ConfigError(f"{path}: {task}, {method} must be a list of seeds, as [0, 10], got {one_line(repr(seeds))}")
+    return {(task, method): seeds for task, rows in table.items() for method, seeds in rows.items()}
+
+
+def _reported(runs: Sequence[Run], chosen: Collection[int]) -> list[Run]:
     """Runs of a row in order of their seeds; seeds on which settings were chosen only if there are no others."""
-    chosen = set(tuned_on)
     marked = [run._replace(tuned_on=run.seed in chosen) for run in sorted(runs, key=lambda run: run.seed)]
     return [run for run in marked if not run.tuned_on] or marked
 

@@ -270,6 +270,14 @@ def test_tuning_seeds_are_left_out_or_named(tmp_path: Path) -> None:
     assert notes_of_row(methods["tbc-hrl"], methods) == []
 
 
+@pytest.mark.parametrize("seeds", ["0", "", "['0']", "[true]", "{0: 1}"])
+def test_tuning_seeds_that_are_no_seeds(seeds: str, tmp_path: Path) -> None:
+    fake_run(tmp_path, "A", "sac", 0, 1.0)
+    (tmp_path / "tuning_seeds.yml").write_text(f"A:\n  sac: {seeds}\n")
+    with pytest.raises(ConfigError, match=r"tuning_seeds.yml: A, sac must be a list of seeds, as \[0, 10\], got "):
+        load_results(tmp_path)
+
+
 def test_ablations_of_the_papers_settings_are_compared_with_these(tmp_path: Path) -> None:
     for variant, rate, ratio in (("full", 1.0, 0.5), ("full-paper", 0.6, 1.0), ("no-ts", 0.7, 0.5)):
         fake_run(tmp_path, "A", "tbc-hrl", 0, rate, variant, config={"model": {"gradient_ratio": ratio}})
