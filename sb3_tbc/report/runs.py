@@ -133,7 +133,9 @@ def _tuning_seeds(path: Path) -> dict[tuple[str, str], list[int]]:
     for task, rows in (table := read_table(path)).items():
         for method, seeds in rows.items():
             if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
-                raise ConfigError(f"{path}: {task}, {method} must be a list of seeds, as [0, 10], got {one_line(repr(seeds))}")
+                raise ConfigError(
+                    f"{path}: {task}, {method} must be a list of seeds, as [0, 10], got {one_line(repr(seeds))}"
+                )
     return {(task, method): seeds for task, rows in table.items() for method, seeds in rows.items()}
 
 

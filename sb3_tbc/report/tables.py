@@ -169,16 +169,22 @@ def overall_table(results: Results) -> Table:
     several = len(results) > 1
     names = list(dict.fromkeys(m for methods in results.values() for m in shipped(methods))) if several else []
     for method in names:
-        rows = [methods[method] for methods in results.values() if method in methods]
-        iqm = stats.interquartile_mean([successes(runs) for runs in rows])
+        rows = {task: methods[method] for task, methods in results.items() if method in methods}
+        iqm = stats.interquartile_mean([successes(runs) for runs in rows.values()])
         low, high = iqm.low, iqm.high
-        middle = sum(run.episodes for runs in rows for run in runs) // 2  # episodes of the middle half of the runs
-        if middle:  # runs that all succeed would give an interval of width zero
+        if middle := _episodes_of_middle_half(list(rows.values())):
             exact = stats.clopper_pearson(round(iqm.mean * middle), middle)
             low, high = min(low, exact[0]), max(high, exact[1])
-        counts = [str(len(rows)), str(sum(map(len, rows)))]
+        tasks = "all" if len(rows) == len(results) else ", ".join(rows)
+        counts = [tasks, str(sum(map(len, rows.values())))]
         table.append([method, *counts, f"{iqm.mean:.3f}", f"{low:.3f} to {high:.3f}"])
     return table
+
+
+def _episodes_of_middle_half(rows: Sequence[Sequence[Run]]) -> int:
+    """Episodes that would tell as much if all weighed the same: runs that all succeed are no interval of width zero."""
+    runs = [(run.episodes, 1.0 / (len(rows) * len(row))) for row in rows for run in row]
+    return int(0.5 / sum(weight**2 / count for count, weight in runs)) if all(count for count, _ in runs) else 0
 
 
 def conditions_table(results: Results) -> Table:

@@ -65,8 +65,10 @@ def test_seeds_that_all_succeed_leave_some_doubt(tmp_path: Path) -> None:
     assert row_of(tmp_path, "tbc-hrl")["95 % interval"] == "0.993 to 1.000"
     fake_run(tmp_path, "B", "tbc-hrl", 0, 1.0)
     overall = tables.overall_table(load_results(tmp_path))[1]
-    assert overall[:4] == ["tbc-hrl", "2", "6", "1.000"]
-    assert overall[-1] == "0.988 to 1.000"
+    assert overall[:4] == ["tbc-hrl", "all", "6", "1.000"]
+    assert overall[-1] == "0.978 to 1.000"
+    fake_run(tmp_path, "B", "sac", 0, 1.0)
+    assert tables.overall_table(load_results(tmp_path))[2][:3] == ["sac", "B", "1"]
 
 
 def test_variants_and_ablations_never_are_baselines(tmp_path: Path) -> None:
