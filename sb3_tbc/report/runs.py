@@ -193,6 +193,11 @@ def successes(runs: Sequence[Run]) -> list[float]:
     return [float(run.final["success_rate"]) for run in runs]
 
 
+def stable_shares(runs: Sequence[Run]) -> list[float]:
+    """Share of evaluations at 0.9 or more from the first of them on, of each seed that was evaluated; 0 without one."""
+    return [float(run.final.get("stable_share") or 0.0) for run in runs if run.rows]
+
+
 def load_descriptions(root: Path) -> dict[str, dict[str, str]]:
     """Descriptions of the rows, one line each; empty if the folder has no such file.
 

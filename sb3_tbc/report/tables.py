@@ -10,7 +10,7 @@ from sb3_tbc import stats
 from sb3_tbc.report.comparisons import Row, against_ablations, against_baselines, interval_of
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.paper import Paper
-from sb3_tbc.report.runs import OURS, Results, Run, describe, reference_of, shipped, successes
+from sb3_tbc.report.runs import OURS, Results, Run, describe, reference_of, shipped, stable_shares, successes
 
 Table = list[list[str]]
 Descriptions = Mapping[str, Mapping[str, str]]
@@ -25,8 +25,8 @@ NOTES = (
     "(Clopper-Pearson); with one or two seeds the exact interval alone, which holds for these agents and not for "
     "other seeds. Length: mean steps of successful episodes. Subgoals: share of windows that reached theirs. Window: "
     "mean executed length in steps. To 0.9: steps until an evaluation first succeeds in 0.9 of its episodes. Stable: "
-    "share of evaluations at 0.9 or more from then on, mean over seeds. Worst: the lowest of these evaluations, of "
-    "all seeds."
+    "share of evaluations at 0.9 or more from then on, 0 for a seed without one, mean over seeds. Worst: the lowest of "
+    "these evaluations, of all seeds."
 )
 DEPARTURE_NOTES = (
     "Settings of tbc-hrl that differ between --config paper (its tables and text) and --config tuned (shipped). "
@@ -63,7 +63,7 @@ def _success_row(task: str, method: str, runs: Sequence[Run]) -> list[str]:
         mean_of(runs, "subgoal_success", "{:.2f}"),
         mean_of(runs, "mean_window", "{:.1f}"),
         steps_to_90(runs),
-        mean_of(runs, "stable_share", "{:.2f}"),
+        f"{np.mean(shares):.2f}" if (shares := stable_shares(runs)) else "-",
         worst(runs),
     ]
 

@@ -132,6 +132,20 @@ def test_comparisons_are_tested_over_seeds_and_corrected_together(tmp_path: Path
     assert verdicts[best, "B"] == f"{SAME} (fewer than three seeds)"
 
 
+def test_seeds_that_never_get_there_are_not_stable(tmp_path: Path) -> None:
+    """A few seeds that learn do not beat a baseline that always does."""
+    for seed in range(5):
+        learns = seed < 2
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0 if learns else 0.3, stable_share=1.0 if learns else None)
+        for other in ("hits", "hac"):
+            fake_run(tmp_path, "A", other, seed, 0.95, stable_share=0.85 + seed / 500)
+    found = [claim for claim in claims(load_results(tmp_path)) if "stably" in claim.text]
+    assert [claim.verdict for claim in found] == [SAME, SAME]
+    assert ["against hac" in found[0].evidence, "against hits" in found[1].evidence] == [True, True]
+    assert "once there, 0 for seeds never there: -0.45" in found[0].evidence
+    assert row_of(tmp_path, "tbc-hrl")["stable"] == "0.40"
+
+
 def test_ablations_are_compared_with_the_full_model(tmp_path: Path) -> None:
     for seed in range(3):
         fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 0.9 + seed / 100)
