@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.report.runs import OURS, Results, Run, reference_of, shipped, with_defaults
+from sb3_tbc.report.runs import BEGIN_ALIKE, OURS, Results, Run, reference_of, shipped, with_defaults
 from sb3_tbc.tasks import TASKS
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.schema import CONFIG_CLASSES
@@ -129,6 +129,8 @@ def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]]) ->
     other = reference_of(runs[0].method)
     notes = differences(runs, reference[other]) if other in reference else []
     notes += _settings_notes(runs)
+    if runs[0].final["task"] in BEGIN_ALIKE:
+        notes.append("all episodes begin alike: one counts per seed")
     if any(run.tuned_on for run in runs):
         notes.append("settings were chosen on the seed that is reported")
     dirty = [run.seed for run in runs if run.versions and run.dirty]

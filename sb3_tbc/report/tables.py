@@ -22,8 +22,9 @@ HEADER = (
 NOTES = (
     "Success: share of the final evaluation's episodes, mean over seeds. Interval: with three seeds or more a "
     "bootstrap over seeds (10,000 resamples), widened where needed to the exact interval over episodes "
-    "(Clopper-Pearson); with one or two seeds the exact interval alone, which holds for these agents and not for "
-    "other seeds. Length: mean steps of successful episodes. Subgoals: share of windows that reached theirs. Window: "
+    "(Clopper-Pearson; of episodes that begin alike, one per seed); with one or two seeds the exact interval alone, "
+    "which holds for these agents and not for other seeds. Length: mean steps of successful episodes. Subgoals: share of "
+    "windows that reached theirs. Window: "
     "mean executed length in steps. To 0.9: steps until an evaluation first succeeds in 0.9 of its episodes. Stable: "
     "share of evaluations at 0.9 or more from then on, 0 for a seed without one, mean over seeds. Worst: the lowest of "
     "these evaluations, of all seeds."

@@ -6,9 +6,11 @@ import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from made_up_runs import fake_run
+from sb3_tbc.tasks import make_task
 
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.report import tables
@@ -27,7 +29,7 @@ from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.departures import departures_of, departures_table
 from sb3_tbc.report.paper import load_paper
 from sb3_tbc.report.planned import missing_table
-from sb3_tbc.report.runs import Curve, describe, load_descriptions, load_results, on_union_of_steps
+from sb3_tbc.report.runs import BEGIN_ALIKE, Curve, describe, load_descriptions, load_results, on_union_of_steps
 from sb3_tbc.reproduce import jobs
 from sb3_tbc.zoo.config import load_config, merge
 
@@ -69,6 +71,22 @@ def test_seeds_that_all_succeed_leave_some_doubt(tmp_path: Path) -> None:
     assert overall[-1] == "0.978 to 1.000"
     fake_run(tmp_path, "B", "sac", 0, 1.0)
     assert tables.overall_table(load_results(tmp_path))[2][:3] == ["sac", "B", "1"]
+
+
+def test_episodes_that_begin_alike_count_once(tmp_path: Path) -> None:
+    for seed in range(3):
+        fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 1.0)
+    assert row_of(tmp_path, "tbc-hrl")["95 % interval"] == "0.292 to 1.000"
+    methods = load_results(tmp_path)["Drawbridge"]
+    assert notes_of_row(methods["tbc-hrl"], methods) == ["all episodes begin alike: one counts per seed"]
+
+
+@pytest.mark.parametrize("task", ["Drawbridge", "Pendulum", "Platforms", "Tennis2D"])
+def test_which_tasks_begin_alike(task: str) -> None:
+    env = make_task(task)
+    first, second = (env.reset(seed=seed)[0] for seed in (1, 2))
+    alike = all(np.array_equal(first[key], second[key]) for key in first)
+    assert alike == (task in BEGIN_ALIKE)
 
 
 def test_variants_and_ablations_never_are_baselines(tmp_path: Path) -> None:
