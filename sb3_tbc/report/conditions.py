@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
+from pathlib import Path
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.report.runs import BEGIN_ALIKE, OURS, Results, Run, reference_of, shipped, with_defaults
+from sb3_tbc.report.runs import BEGIN_ALIKE, OURS, Results, Run, reference_of, row_of, shipped, with_defaults
 from sb3_tbc.tasks import TASKS
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.schema import CONFIG_CLASSES
@@ -119,18 +120,21 @@ def _few(names: Sequence[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]]) -> list[str]:
+def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]], failed: Sequence[Path] = ()) -> list[str]:
     """Notes on a single row: unequal conditions, other settings than its name says, code that differs from its commit.
 
     :param runs: runs of the row
     :param reference: all rows of the task; ours is the one to compare with, for ablations of the paper's settings that
         with these settings
+    :param failed: folders of failed runs of all rows
     """
     other = reference_of(runs[0].method)
     notes = differences(runs, reference[other]) if other in reference else []
     notes += _settings_notes(runs)
     if runs[0].final["task"] in BEGIN_ALIKE:
         notes.append("all episodes begin alike: one counts per seed")
+    if count := sum(row_of(path) == (runs[0].final["task"], runs[0].method) for path in failed):
+        notes.append(f"{count} failed")
     if any(run.tuned_on for run in runs):
         notes.append("settings were chosen on the seed that is reported")
     dirty = [run.seed for run in runs if run.versions and run.dirty]

@@ -55,8 +55,7 @@ class Run(NamedTuple):
     @property
     def method(self) -> str:
         """The algorithm, with the variant if it is not the shipped one."""
-        algo, variant = str(self.final["algo"]), str(self.final["variant"])
-        return algo if variant == SHIPPED else f"{algo} {variant}"
+        return method_name(str(self.final["algo"]), str(self.final["variant"]))
 
     @property
     def settings(self) -> Plain:
@@ -96,6 +95,17 @@ class Run(NamedTuple):
         return self.commit.endswith("+") or self.commit == "unknown"
 
 
+def method_name(algo: str, variant: str) -> str:
+    """The algorithm, with the variant if it is not the shipped one."""
+    return algo if variant == SHIPPED else f"{algo} {variant}"
+
+
+def row_of(folder: Path) -> tuple[str, str]:
+    """Task and method of a run's folder."""
+    task, algo, variant, _ = folder.parts[-4:]
+    return task, method_name(algo, variant)
+
+
 def with_defaults(algo: str, model: PlainMapping) -> Plain:
     """Settings with the defaults of those that are not given. They are not checked: names may have gone since."""
     return merge(_defaults(algo), {name: value for name, value in model.items() if name != "policy"})
@@ -124,6 +134,8 @@ def load_results(root: Path) -> Results:
             results[str(run.final["task"])][run.method].append(run)
         except (KeyError, ValueError, TypeError) as error:
             raise ConfigError(f"cannot read the run in {folder.path}: {error}") from error
+    if not results and (failed := failed_runs(root)):
+        raise ConfigError(f"no finished runs below {root}, and {len(failed)} that failed, e.g. {failed[0]}/failed.json")
     if not results:
         raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
     tuned = _tuning_seeds(root / TUNING_SEEDS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from sb3_tbc import stats
 from sb3_tbc.report.comparisons import Row, against_ablations, against_baselines, interval_of
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.paper import Paper
-from sb3_tbc.report.runs import OURS, Results, Run, describe, reference_of, shipped, stable_shares, successes
+from sb3_tbc.report.runs import OURS, Results, Run, describe, reference_of, row_of, shipped, stable_shares, successes
 
 Table = list[list[str]]
 Descriptions = Mapping[str, Mapping[str, str]]
@@ -23,11 +24,10 @@ NOTES = (
     "Success: share of the final evaluation's episodes, mean over seeds. Interval: with three seeds or more a "
     "bootstrap over seeds (10,000 resamples), widened where needed to the exact interval over episodes "
     "(Clopper-Pearson; of episodes that begin alike, one per seed); with one or two seeds the exact interval alone, "
-    "which holds for these agents and not for other seeds. Length: mean steps of successful episodes. Subgoals: share of "
-    "windows that reached theirs. Window: "
-    "mean executed length in steps. To 0.9: steps until an evaluation first succeeds in 0.9 of its episodes. Stable: "
-    "share of evaluations at 0.9 or more from then on, 0 for a seed without one, mean over seeds. Worst: the lowest of "
-    "these evaluations, of all seeds."
+    "which holds for these agents and not for other seeds. Length: mean steps of successful episodes. Subgoals: share "
+    "of windows that reached theirs. Window: mean executed length in steps. To 0.9: steps until an evaluation first "
+    "succeeds in 0.9 of its episodes. Stable: share of evaluations at 0.9 or more from then on, 0 for a seed without "
+    "one, mean over seeds. Worst: the lowest of these evaluations, of all seeds."
 )
 DEPARTURE_NOTES = (
     "Settings of tbc-hrl that differ between --config paper (its tables and text) and --config tuned (shipped). "
@@ -39,6 +39,10 @@ COMPARISON_NOTES = (
     "side, nor where no seed differs from another. Better: probability that a run of ours beats one of theirs, ties "
     "counted half. Steps saved: to the common threshold, 0.9 of the best mean success of any method on the task, "
     "where that is 0.5 or more; evaluations are far apart, so small differences mean little."
+)
+OVERALL_NOTES = (
+    "Shipped settings; mean of the middle half of all runs. Tasks weigh the same, however many seeds they have; seeds are "
+    "resampled within them. Only rows of the same tasks can be compared."
 )
 
 
@@ -140,17 +144,24 @@ def _steps(runs: Sequence[Run]) -> str:
     return " or ".join(f"{count:,}" for count in steps) or "-"
 
 
-def description_table(task: str, methods: Mapping[str, Sequence[Run]], descriptions: Descriptions) -> Table:
+def description_table(
+    task: str, methods: Mapping[str, Sequence[Run]], descriptions: Descriptions, failed: Sequence[Path]
+) -> Table:
     """Description of each row of a task, with its steps, minutes, machine and notes."""
     table = [["method", "what it is", "steps", "minutes", "machine", "notes"]]
     for method, runs in methods.items():
         minutes = [run.final["wall_time"] / 60 for run in runs if run.final.get("wall_time")]
         machines = sorted({str(run.versions.get("cpu")) for run in runs if run.versions.get("cpu")})
-        notes = notes_of_row(runs, methods)
+        notes = notes_of_row(runs, methods, failed)
         cells = [describe(descriptions, task, method) or "-", _steps(runs)]
         cells += [f"{np.mean(minutes):.0f}" if minutes else "-", ", ".join(machines) or "-", "; ".join(notes) or "-"]
         table.append([method, *cells])
     return table
+
+
+def failed_table(failed: Sequence[Path]) -> Table:
+    """Runs that ended in an error, by their folders."""
+    return [["task", "method", "folder"], *([*row_of(path), "/".join(path.parts[-4:])] for path in failed)]
 
 
 def spread_table(results: Results) -> Table:
