@@ -41,8 +41,8 @@ COMPARISON_NOTES = (
     "where that is 0.5 or more; evaluations are far apart, so small differences mean little."
 )
 OVERALL_NOTES = (
-    "Shipped settings; mean of the middle half of all runs. Tasks weigh the same, however many seeds they have; seeds are "
-    "resampled within them. Only rows of the same tasks can be compared."
+    "Shipped settings; mean of the middle half of all runs. Tasks weigh the same, however many seeds they have; seeds "
+    "are resampled within them. Only rows of the same tasks can be compared."
 )
 
 
