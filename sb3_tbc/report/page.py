@@ -30,8 +30,9 @@ TEXT_COLUMNS = (
     "folder",
 )
 INTRODUCTION = (
-    "Rows without a further name have the shipped settings. Lines are means over seeds, bands their 95 % bootstrap "
-    "intervals, dots every measured evaluation. Point at a curve to read its values, at a name to highlight its curve."
+    "Rows without a further name have the shipped settings, unless a note says otherwise. Lines are means over seeds, "
+    "bands their 95 % bootstrap intervals, dots every measured evaluation. Point at a curve to read its values, at a "
+    "name to highlight its curve."
 )
 
 

@@ -66,8 +66,8 @@ def sections(report: Report) -> list[Section]:
         Section(
             "Planned and missing",
             report.missing,
-            "Planned runs that are not in the ledger, and the command that makes them. Runs that were trained or evaluated "
-            "otherwise than planned do not count; they have to be moved away before.",
+            "Planned runs that are not in the ledger, and the command that makes them. Runs that were trained or "
+            "evaluated otherwise than planned do not count; they have to be moved away before.",
         ),
         Section(
             "Failed",
