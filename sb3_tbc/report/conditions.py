@@ -15,17 +15,25 @@ from sb3_tbc.zoo.schema import CONFIG_CLASSES
 TWO_LEVELS = ("tbc-hrl", "hits", "hac")
 
 
-def _of_levels(run: Run, name: str) -> str:
-    """A setting of both levels, or of the agent where a level has none of its own."""
-    model = run.settings
-    own = [(model.get(level) or {}).get(name) for level in ("high", "low")]
-    high, low = (_decimal(model.get(name) if value is None else value) for value in own)
-    return high if high == low else f"{high} high and {low} low"
+def _of_level(run: Run, level: str, name: str) -> object:
+    """A setting of a level, or of the agent where a level has none of its own."""
+    own = (run.settings.get(level) or {}).get(name)
+    return run.settings.get(name) if own is None else own
 
 
-def _decimal(value: object) -> str:
-    """1 and 1.0 are the same setting."""
-    return str(float(value) if isinstance(value, int) else value)
+def _low(name: str) -> Callable[[Run], object]:
+    """A setting of the low level, or of an agent of one level."""
+    return lambda run: _of_level(run, "low", name)
+
+
+def _high(name: str) -> Callable[[Run], object]:
+    """The same setting of the high level, if there is one."""
+
+    def value(run: Run) -> object:
+        high, low = (_of_level(run, level, name) for level in ("high", "low"))
+        return None if run.final["algo"] not in TWO_LEVELS else "as the low level's" if high == low else high
+
+    return value
 
 
 def _subgoal_view(run: Run) -> str | None:
@@ -39,8 +47,10 @@ CONDITIONS: dict[str, Callable[[Run], object]] = {
     "subgoals seen": _subgoal_view,
     "training steps": lambda run: run.config.get("n_timesteps", run.final.get("n_timesteps")),
     "environments": lambda run: run.config.get("n_envs", 1),
-    "updates per step": lambda run: _of_levels(run, "gradient_ratio"),
-    "weight averaging": lambda run: _of_levels(run, "average_decay"),
+    "updates per step": _low("gradient_ratio"),
+    "high level's updates per step": _high("gradient_ratio"),
+    "weight averaging": _low("average_decay"),
+    "high level's weight averaging": _high("average_decay"),
     "settings": lambda run: run.final.get("config"),
     "steps between evaluations": lambda run: run.config.get("eval_freq"),
     "episodes per evaluation": lambda run: run.config.get("n_eval_episodes"),
@@ -93,7 +103,7 @@ def flat(settings: PlainMapping, prefix: str = "") -> Plain:
     """Settings of all levels under dotted names."""
     found: Plain = {}
     for name, value in settings.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {prefix + name: value}
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return found
 
 

@@ -98,7 +98,7 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
             done = sum(map(row.done_by, results.get(row.task, {}).get(row.method, [])))
             if done < len(row.seeds):
                 table.append([row.task, row.method, f"{done} of {len(row.seeds)}", row.command()])
-    except (KeyError, IndexError, TypeError, ValueError) as error:
+    except (KeyError, IndexError, AttributeError, TypeError, ValueError, OverflowError) as error:
         said = error if isinstance(error, ConfigError) else repr(error)
         raise ConfigError(f"cannot read the plan {path}: {said}") from error
     return table

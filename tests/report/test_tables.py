@@ -221,7 +221,7 @@ def test_defaults_are_compared_as_the_values_they_stand_for(tmp_path: Path) -> N
     fake_run(tmp_path, "A", "hac", 0, 1.0, config={"model": {}})
     fake_run(tmp_path, "A", "sac", 0, 1.0, config={"model": {}})
     assert unequal_conditions(load_results(tmp_path))["A"] == {
-        "hits": ["updates per step: 0.5 high and 1.0 low (1.0)"],
+        "hits": ["high level's updates per step: 0.5 (as the low level's)"],
         "sac": ["weight averaging: 0.0 (0.999)"],
     }
 
@@ -378,9 +378,11 @@ def test_missing_runs_come_with_a_command_that_is_understood(tmp_path: Path) -> 
         assert "--n-eval-episodes" in planned[0].arguments
         variants.append(planned[0].target.path.parent.name)
     assert variants == ["full", "no-ts", "full-paper"]
-    (tmp_path / "campaign.yml").write_text("runs: 3")
-    with pytest.raises(ConfigError, match="cannot read the plan"):
-        missing_table(tmp_path, load_results(tmp_path))
+    many = f"{{first_seed: 0, runs: [{{task: A, seeds: {10**30}, methods: [sac]}}]}}"
+    for wrong in ("runs: 3", "runs: [options]", many):
+        (tmp_path / "campaign.yml").write_text(wrong)
+        with pytest.raises(ConfigError, match="cannot read the plan"):
+            missing_table(tmp_path, load_results(tmp_path))
 
 
 def test_runs_made_otherwise_than_planned_do_not_count(tmp_path: Path) -> None:
