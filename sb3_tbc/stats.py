@@ -89,8 +89,9 @@ def success_interval(
 
     From three seeds on, the seed is the unit: the interval is the percentile bootstrap over seed means (paper, section
     5.1). Seeds that all end at 1.00 would give it width zero, although an episode may still fail. So either end is
-    moved outwards, where needed, to that of the exact interval over all episodes (Clopper-Pearson). With one or two
-    seeds the exact interval stands alone: it holds for these agents, not for other seeds.
+    moved outwards, where needed, to that of the exact interval over all episodes (Clopper-Pearson), of which the mean
+    over seeds succeeded. With one or two seeds the exact interval stands alone: it holds for these agents, not for
+    other seeds.
 
     :param rates: final success rate of each seed, ``(n_seeds,)``
     :param episodes: episodes behind each of them
@@ -101,7 +102,7 @@ def success_interval(
         raise ValueError(f"need one rate and one number of episodes per seed, got {sample.shape} and {len(episodes)}")
     interval = bootstrap_mean(sample, confidence, n_resamples)
     trials = int(sum(episodes))
-    exact = clopper_pearson(round(float(np.dot(sample, episodes))), trials, confidence)
+    exact = clopper_pearson(round(interval.mean * trials), trials, confidence)
     if len(sample) < FEWEST_SEEDS:
         return Interval(interval.mean, *exact)
     return Interval(interval.mean, min(interval.low, exact[0]), max(interval.high, exact[1]))
@@ -231,17 +232,28 @@ def probability_of_improvement(first: ArrayLike, second: ArrayLike) -> float:
 def interquartile_mean(tasks: Sequence[ArrayLike], confidence: float = 0.95, n_resamples: int = 10_000) -> Interval:
     """Mean of the middle half of all runs, over tasks; its interval resamples seeds within each task.
 
+    All tasks weigh the same, however many seeds they have.
+
     :param tasks: per task one number per seed
     :raises ValueError: if there is no task or one without a seed
     """
     samples = [np.asarray(task, dtype=np.float64) for task in tasks]
     if not samples or any(sample.size == 0 for sample in samples):
         raise ValueError(f"need tasks with at least one seed each, got {[sample.size for sample in samples]}")
+    weights = np.concatenate([np.full(len(sample), 1.0 / (len(sample) * len(samples))) for sample in samples])
     rng = np.random.default_rng(0)
     draws = [sample[rng.integers(len(sample), size=(n_resamples, len(sample)))] for sample in samples]
-    middle = stats.trim_mean(np.concatenate(draws, axis=1), 0.25, axis=1)
+    middle = _middle_half(np.concatenate(draws, axis=1), weights)
     low, high = np.percentile(middle, [50 * (1 - confidence), 50 * (1 + confidence)])
-    return Interval(float(stats.trim_mean(np.concatenate(samples), 0.25)), float(low), float(high))
+    return Interval(float(_middle_half(np.concatenate(samples), weights)), float(low), float(high))
+
+
+def _middle_half(values: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Weighted means of the middle half of values ``(..., n)``; weights ``(n,)`` add up to 1."""
+    order = np.argsort(values, axis=-1)
+    ends = np.cumsum(weights[order], axis=-1)
+    within = np.clip(ends, 0.25, 0.75) - np.clip(ends - weights[order], 0.25, 0.75)
+    return np.asarray(2.0 * (within * np.take_along_axis(values, order, axis=-1)).sum(axis=-1))
 
 
 def spread(values: ArrayLike) -> Spread:

@@ -184,6 +184,7 @@ def test_interquartile_mean_and_spread() -> None:
     assert iqm.mean == pytest.approx(scipy_stats.trim_mean(np.concatenate(tasks), 0.25))
     assert iqm.low < iqm.mean < iqm.high
     assert stats.interquartile_mean([[0.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0]]).mean == 1.0
+    assert stats.interquartile_mean([[0.0, 1.0, 4.0]]).mean == pytest.approx(1.0 * 2 / 3 + 4.0 / 6)
     assert stats.spread(np.arange(11.0)) == (0.0, 1.0, 9.0, 10.0)
     with pytest.raises(ValueError, match="at least one seed"):
         stats.interquartile_mean([[]])
@@ -216,10 +217,17 @@ def test_rates_that_cannot_be(interval: Callable[[int, int], tuple[float, float]
     assert interval(5, 10)[0] < narrow[0] < 0.5 < narrow[1] < interval(5, 10)[1]
 
 
-def test_success_intervals_weigh_seeds_by_their_episodes() -> None:
-    rates, episodes = [1.0, 0.5], [10, 90]
-    assert stats.success_interval(rates, episodes)[1:] == pytest.approx(stats.clopper_pearson(55, 100))
-    assert stats.success_interval(rates, episodes).mean == 0.75
+def test_every_task_has_the_same_weight_in_the_interquartile_mean() -> None:
+    few, many = stats.interquartile_mean([[1.0] * 2, [0.2] * 2]), stats.interquartile_mean([[1.0] * 10, [0.2]])
+    assert few.mean == pytest.approx(0.6)
+    assert many == pytest.approx(few)
+    assert stats.interquartile_mean([[0.5], [0.1, 0.1], [0.9] * 7]).mean == pytest.approx(2 * (0.5 / 3 + 1.0 / 12))
+
+
+def test_success_intervals_hold_their_mean() -> None:
+    interval = stats.success_interval([0.5, 1.0], [20, 200])
+    assert interval.mean == 0.75
+    assert interval[1:] == pytest.approx(stats.clopper_pearson(165, 220))
     three = stats.success_interval([0.2, 0.5, 0.8], [100] * 3)
     assert three[1:] == stats.bootstrap_mean([0.2, 0.5, 0.8])[1:] == (pytest.approx(0.2), pytest.approx(0.8))
 

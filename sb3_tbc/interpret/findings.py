@@ -153,11 +153,6 @@ def to_plain(found: Findings, identity: PlainMapping) -> Plain:
     }
 
 
-def _information(information: PhaseInformation) -> Plain:
-    bits, control = _rounded(information.bits), _rounded(information.control)
-    return {"bits": bits, "control": control, "n_windows": information.n_windows}
-
-
 def _lesion(result: LesionResult) -> Plain:
     plain = result._asdict()
     for name in ("success", "subgoals"):

@@ -7,13 +7,10 @@ from pathlib import Path
 
 from sb3_tbc.commands import Parser, run_command
 from sb3_tbc.files import write_atomic
-from sb3_tbc.report.departures import departures_table
 from sb3_tbc.report.markdown import curves_csv, to_markdown, update_page
 from sb3_tbc.report.measured import measured_yaml
 from sb3_tbc.report.page import to_html
-from sb3_tbc.report.paper import load_paper
-from sb3_tbc.report.planned import missing_table
-from sb3_tbc.report.runs import failed_runs, load_descriptions, load_results
+from sb3_tbc.report.sections import load_report
 from sb3_tbc.report.tables import NOTES, all_tables, to_text
 
 EXAMPLES = {
@@ -40,21 +37,19 @@ def build_parser() -> Parser:
 def command(argv: Sequence[str]) -> int:
     """Report; see ``--help``."""
     args = build_parser().parse_args(argv)
-    results = load_results(args.results)
-    descriptions, paper, failed = load_descriptions(args.results), load_paper(), failed_runs(args.results)
-    missing, departed = missing_table(args.results, results), departures_table(args.results, results)
-    print("\n\n".join(f"{title}\n\n{to_text(table)}" for title, table in all_tables(results).items()))
+    report = load_report(args.results)
+    print("\n\n".join(f"{title}\n\n{to_text(table)}" for title, table in all_tables(report.results).items()))
     print(f"\n{NOTES}")
-    if failed:
-        print("\n" + "\n".join(f"failed         {path}" for path in failed))
+    if report.failed:
+        print("\n" + "\n".join(f"failed         {path}" for path in report.failed))
     if args.update is not None:
-        update_page(args.update, to_markdown(results, descriptions, paper, missing, departed))
+        update_page(args.update, to_markdown(report))
     if args.curves is not None:
-        write_atomic(args.curves, curves_csv(results))
+        write_atomic(args.curves, curves_csv(report.results))
     if args.measured is not None:
-        write_atomic(args.measured, measured_yaml(results))
+        write_atomic(args.measured, measured_yaml(report.results))
     if args.html is not None:
-        write_atomic(args.html, to_html(results, descriptions, paper, failed, missing, departed, args.html))
+        write_atomic(args.html, to_html(report, args.html))
         print(f"\nreport         {args.html}")
     return 0
 

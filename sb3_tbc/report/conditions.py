@@ -3,35 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
 
-from sb3_tbc.report.runs import OURS, Results, Run, reference_of, shipped
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.report.runs import BEGIN_ALIKE, OURS, Results, Run, reference_of, row_of, shipped, with_defaults
+from sb3_tbc.tasks import TASKS
+from sb3_tbc.zoo.config import load_config
+from sb3_tbc.zoo.schema import CONFIG_CLASSES
 
 TWO_LEVELS = ("tbc-hrl", "hits", "hac")
 
 
-def _level(run: Run, level: str, key: str) -> object:
-    """A setting of a level, or of the agent itself if it has only one level."""
-    model = run.config.get("model") or {}
-    return (model.get(level) or model).get(key)
+def _of_level(run: Run, level: str, name: str) -> object:
+    """A setting of a level, or of the agent where a level has none of its own."""
+    own = (run.settings.get(level) or {}).get(name)
+    return run.settings.get(name) if own is None else own
 
 
-def _high_updates(run: Run) -> object:
-    """Updates of the high level per environment step, where they are not the agent's."""
-    model = run.config.get("model") or {}
-    own = (model.get("high") or {}).get("gradient_ratio")
-    return None if own is None or own == model.get("gradient_ratio", 1.0) else own
+def _low(name: str) -> Callable[[Run], object]:
+    """A setting of the low level, or of an agent of one level."""
+    return lambda run: _of_level(run, "low", name)
 
 
-def _averaging(run: Run) -> str:
-    decays = [_level(run, level, "average_decay") for level in ("high", "low")]
-    said = ["default" if decay is None else str(decay) for decay in decays]
-    return said[0] if said == ["default", "default"] else " and ".join(said)
+def _high(name: str) -> Callable[[Run], object]:
+    """The same setting of the high level, if there is one."""
+
+    def value(run: Run) -> object:
+        high, low = (_of_level(run, level, name) for level in ("high", "low"))
+        return None if run.final["algo"] not in TWO_LEVELS else "as the low level's" if high == low else high
+
+    return value
 
 
 def _subgoal_view(run: Run) -> str | None:
     if run.final["algo"] not in TWO_LEVELS:
         return None
-    return "relative" if (run.config.get("model") or {}).get("relative_subgoals") else "absolute"
+    return "relative" if run.settings.get("relative_subgoals") else "absolute"
 
 
 CONDITIONS: dict[str, Callable[[Run], object]] = {
@@ -39,9 +47,10 @@ CONDITIONS: dict[str, Callable[[Run], object]] = {
     "subgoals seen": _subgoal_view,
     "training steps": lambda run: run.config.get("n_timesteps", run.final.get("n_timesteps")),
     "environments": lambda run: run.config.get("n_envs", 1),
-    "updates per step": lambda run: (run.config.get("model") or {}).get("gradient_ratio", 1.0),
-    "high level's updates per step": _high_updates,
-    "weight averaging": _averaging,
+    "updates per step": _low("gradient_ratio"),
+    "high level's updates per step": _high("gradient_ratio"),
+    "weight averaging": _low("average_decay"),
+    "high level's weight averaging": _high("average_decay"),
     "settings": lambda run: run.final.get("config"),
     "steps between evaluations": lambda run: run.config.get("eval_freq"),
     "episodes per evaluation": lambda run: run.config.get("n_eval_episodes"),
@@ -90,15 +99,52 @@ def unequal_conditions(results: Results) -> dict[str, dict[str, list[str]]]:
     return {task: rows for task, rows in found.items() if rows}
 
 
-def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]]) -> list[str]:
-    """Notes on a single row: unequal conditions, and code that differs from its commit.
+def flat(settings: PlainMapping, prefix: str = "") -> Plain:
+    """Settings of all levels under dotted names."""
+    found: Plain = {}
+    for name, value in settings.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return found
+
+
+@cache
+def _shipped_settings(algo: str, task: str) -> Plain:
+    return flat(with_defaults(algo, load_config(algo, task).model))
+
+
+def _settings_notes(runs: Sequence[Run]) -> list[str]:
+    """Whether a row's settings differ between its seeds, and from those shipped now where its name says it has them."""
+    seeds = [flat(run.settings) for run in runs if run.config.get("model")]
+    algo, task = runs[0].method, str(runs[0].final["task"])
+    notes = {"settings differ between seeds": _changed(seeds[0], seeds) if seeds else []}
+    if algo in CONFIG_CLASSES and task in TASKS:
+        notes["not the shipped settings"] = _changed(_shipped_settings(algo, task), seeds)
+    return [f"{said}: {_few(names)}" for said, names in notes.items() if names]
+
+
+def _changed(first: Plain, others: Sequence[Plain]) -> list[str]:
+    return sorted({name for other in others for name in first | other if first.get(name) != other.get(name)})
+
+
+def _few(names: Sequence[str], most: int = 3) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]], failed: Sequence[Path] = ()) -> list[str]:
+    """Notes on a single row: unequal conditions, other settings than its name says, code that differs from its commit.
 
     :param runs: runs of the row
     :param reference: all rows of the task; ours is the one to compare with, for ablations of the paper's settings that
         with these settings
+    :param failed: folders of failed runs of all rows
     """
     other = reference_of(runs[0].method)
     notes = differences(runs, reference[other]) if other in reference else []
+    notes += _settings_notes(runs)
+    if runs[0].final["task"] in BEGIN_ALIKE:
+        notes.append("all episodes begin alike: one counts per seed")
+    if count := sum(row_of(path) == (runs[0].final["task"], runs[0].method) for path in failed):
+        notes.append(f"{count} failed")
     if any(run.tuned_on for run in runs):
         notes.append("settings were chosen on the seed that is reported")
     dirty = [run.seed for run in runs if run.versions and run.dirty]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.report.comparisons import difference_of
-from sb3_tbc.report.conditions import differences
+from sb3_tbc.report.conditions import differences, flat
 from sb3_tbc.report.runs import OURS, Results, read_table
 from sb3_tbc.zoo.config import load_config
 
@@ -28,17 +28,6 @@ class Departure(NamedTuple):
     measured: tuple[str, ...]
 
 
-def flat(settings: PlainMapping, prefix: str = "") -> dict[str, str]:
-    """Settings of all levels under dotted names, as text."""
-    found: dict[str, str] = {}
-    for name, value in settings.items():
-        if isinstance(value, Mapping):
-            found |= flat(value, f"{prefix}{name}.")
-        else:
-            found[prefix + name] = "none" if value is None else str(value)
-    return found
-
-
 def departures_of(task: str) -> dict[str, tuple[str, str]]:
     """Setting -> the paper's value and the shipped one, where they differ; ``default`` where a section is silent."""
     paper, shipped = (load_config(OURS, task, config) for config in ("paper", "tuned"))
@@ -46,8 +35,13 @@ def departures_of(task: str) -> dict[str, tuple[str, str]]:
         flat({**run.model, "n_timesteps": run.n_timesteps, "n_envs": run.n_envs, "env": run.env_kwargs})
         for run in (paper, shipped)
     ]
-    both = {name: (values[0].get(name, "default"), values[1].get(name, "default")) for name in values[0] | values[1]}
-    return {name: pair for name, pair in sorted(both.items()) if pair[0] != pair[1]}
+    both = {name: (_text(values[0], name), _text(values[1], name)) for name in sorted(values[0] | values[1])}
+    return {name: pair for name, pair in both.items() if pair[0] != pair[1]}
+
+
+def _text(values: PlainMapping, name: str) -> str:
+    value = values.get(name, "default")
+    return "none" if value is None else str(value)
 
 
 def departures(root: Path, results: Results) -> list[Departure]:

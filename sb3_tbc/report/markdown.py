@@ -4,48 +4,24 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
 from pathlib import Path
 
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_atomic
 from sb3_tbc.report import tables
-from sb3_tbc.report.claims import claims_table
-from sb3_tbc.report.comparisons import against_ablations, against_baselines
-from sb3_tbc.report.paper import Paper
 from sb3_tbc.report.runs import Results
+from sb3_tbc.report.sections import Report, sections
 
 MARKS = ("<!-- results:begin -->", "<!-- results:end -->")
 
 
-def to_markdown(
-    results: Results,
-    descriptions: Mapping[str, Mapping[str, str]],
-    paper: Paper,
-    missing: tables.Table,
-    departed: tables.Table,
-) -> str:
-    """All tables, with descriptions of the rows and the planned runs that are missing; empty tables are left out."""
-    sections = [
-        ("Shipped settings beside the paper", tables.paper_table(results, paper), f"Paper: {paper.source}."),
-        ("Against every baseline", tables.comparison_table(against_baselines(results)), tables.COMPARISON_NOTES),
-        ("Against our own ablations", tables.comparison_table(against_ablations(results)), ""),
-        ("Which of the paper's claims hold here", claims_table(results), ""),
-        (
-            "Not run under equal conditions",
-            tables.conditions_table(results),
-            "Baselines that differ from our row in what should be the same; our value in brackets.",
-        ),
-        ("Where the shipped agent departs from the paper", departed, tables.DEPARTURE_NOTES),
-        ("All tasks together", tables.overall_table(results), "Shipped settings; seeds are resampled within tasks."),
-        ("All rows", tables.success_table(results), tables.NOTES),
-        ("Planned and missing", missing, "Planned runs that are not in the ledger, and the command that makes them."),
-        ("How far seeds lie apart", tables.spread_table(results), "Final success of rows with three seeds or more."),
-    ]
-    parts = [f"## {title}\n\n{_said(note)}{tables.to_text(table)}" for title, table, note in sections if len(table) > 1]
+def to_markdown(report: Report) -> str:
+    """All tables, with descriptions of the rows; empty tables are left out."""
+    parts = [f"## {title}\n\n{_said(note)}{tables.to_text(table)}" for title, table, note in sections(report)]
     parts.append("## What each row is\n\nEach run's own command and versions are in its folder.")
-    for task, methods in results.items():
-        parts.append(f"### {task}\n\n{tables.to_text(tables.description_table(task, methods, descriptions))}")
+    for task, methods in report.results.items():
+        described = tables.description_table(task, methods, report.descriptions, report.failed)
+        parts.append(f"### {task}\n\n{tables.to_text(described)}")
     return "\n\n".join(parts)
 
 

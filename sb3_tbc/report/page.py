@@ -8,12 +8,12 @@ from html import escape
 from importlib import resources
 from pathlib import Path
 
-from sb3_tbc.report import curves, tables
-from sb3_tbc.report.claims import claims_table
-from sb3_tbc.report.comparisons import against_ablations, against_baselines
+from sb3_tbc.report import curves
+from sb3_tbc.report.comparisons import against_baselines
 from sb3_tbc.report.conditions import notes_of_row
 from sb3_tbc.report.paper import Figure, Paper
 from sb3_tbc.report.runs import Results, Run, describe, is_shipped
+from sb3_tbc.report.sections import Report, sections
 from sb3_tbc.report.timeline import TRACE, last_episode, option_timeline
 
 TEXT_COLUMNS = (
@@ -27,56 +27,30 @@ TEXT_COLUMNS = (
     "command",
     "what it is worth",
     "tasks",
+    "folder",
 )
 INTRODUCTION = (
-    "Rows without a further name have the shipped settings. Lines are means over seeds, bands their 95 % bootstrap "
-    "intervals, dots every measured evaluation. Point at a curve to read its values, at a name to highlight its curve."
+    "Rows without a further name have the shipped settings, unless a note says otherwise. Lines are means over seeds, "
+    "bands their 95 % bootstrap intervals, dots every measured evaluation. Point at a curve to read its values, at a "
+    "name to highlight its curve."
 )
 
 
-def to_html(
-    results: Results,
-    descriptions: Mapping[str, Mapping[str, str]],
-    paper: Paper,
-    failed: Sequence[Path],
-    missing: Sequence[Sequence[str]],
-    departed: Sequence[Sequence[str]],
-    out: Path,
-) -> str:
+def to_html(report: Report, out: Path) -> str:
     """The whole page.
 
-    :param results: finished runs
-    :param descriptions: descriptions of the rows
-    :param paper: the paper's figures
-    :param failed: folders of runs that ended in an error
-    :param missing: table of planned runs that the ledger lacks
-    :param departed: table of what the shipped agent departs from the paper in
+    :param report: what is to be shown
     :param out: path of the page, for links to films
     """
     style, script = (_template(name) for name in ("page.css", "page.js"))
     body = [
-        *_heading(results, failed),
+        *_heading(report.results, report.failed),
         "<h2>Learning curves</h2>",
-        *_figures(results, descriptions, paper),
-        *_section("Beside the paper", tables.paper_table(results, paper), paper.source),
-        *_section(
-            "Against every baseline", tables.comparison_table(against_baselines(results)), tables.COMPARISON_NOTES
-        ),
-        *_section("Against our own ablations", tables.comparison_table(against_ablations(results)), ""),
-        *_section("Which of the paper's claims hold here", claims_table(results), ""),
-        *_section("Not run under equal conditions", tables.conditions_table(results), "Our value in brackets."),
-        *_section("Where the shipped agent departs from the paper", departed, tables.DEPARTURE_NOTES),
-        *_section(
-            "All tasks together", tables.overall_table(results), "Shipped settings; seeds resampled within tasks."
-        ),
-        *_section("All rows", tables.success_table(results), tables.NOTES),
-        *_section(
-            "How far seeds lie apart", tables.spread_table(results), "Final success, rows of three seeds or more."
-        ),
-        *_section("Planned and missing", missing, ""),
+        *_figures(report.results, report.descriptions, report.paper),
+        *(line for section in sections(report) for line in _section(*section)),
         "<h2>How each row was made</h2>",
-        *_rows(results, descriptions),
-        *_films(results, out),
+        *_rows(report),
+        *_films(report.results, out),
     ]
     return "\n".join(
         [
@@ -102,11 +76,9 @@ def _heading(results: Results, failed: Sequence[Path]) -> list[str]:
     facts.append(_count(len(failed), "failed run") if failed else "no failed runs")
     if dirty:
         facts.append(f"{_count(dirty, 'run')} from code with changes that were not committed, marked below")
-    names = ", ".join(escape("/".join(path.parts[-4:])) for path in failed)
     return [
         "<h1>Results</h1>",
         f"<p>{'; '.join(facts)}.</p>",
-        *([f"<p>Failed: {names}</p>"] if names else []),
         f'<p class="soft">{INTRODUCTION}</p>',
         '<p class="bar"><label><input type="checkbox" id="variants" disabled> show variants and ablations</label>'
         '<button id="theme" type="button" hidden>light or dark</button></p>',
@@ -167,8 +139,6 @@ def _key(
 
 
 def _section(title: str, table: Sequence[Sequence[str]], note: str) -> list[str]:
-    if len(table) < 2:
-        return []
     said = [f'<p class="soft">{escape(note)}</p>'] if note else []
     return [f"<h2>{escape(title)}</h2>", *said, html_table(table)]
 
@@ -192,27 +162,20 @@ def html_table(table: Sequence[Sequence[str]]) -> str:
     return "".join([*parts, "</tbody></table></div>"])
 
 
-def _rows(results: Results, descriptions: Mapping[str, Mapping[str, str]]) -> list[str]:
+def _rows(report: Report) -> list[str]:
     parts = []
-    for task, methods in results.items():
+    for task, methods in report.results.items():
         parts.append(f"<h3>{escape(task)}</h3>")
         for method, runs in methods.items():
-            parts.append(_row(task, method, runs, methods, descriptions))
+            said = describe(report.descriptions, task, method)
+            parts.append(_row(method, runs, said, notes_of_row(runs, methods, report.failed)))
     return parts
 
 
-def _row(
-    task: str,
-    method: str,
-    runs: Sequence[Run],
-    methods: Mapping[str, Sequence[Run]],
-    descriptions: Mapping[str, Mapping[str, str]],
-) -> str:
+def _row(method: str, runs: Sequence[Run], said: str, notes: Sequence[str]) -> str:
     kind = "" if is_shipped(method) else ' class="variant" hidden'
-    said = describe(descriptions, task, method)
-    notes = "".join(f"<li>{escape(note)}</li>" for note in notes_of_row(runs, methods))
     lines = [f"<details{kind}><summary>{escape(method)}{': ' + escape(said) if said else ''}</summary>"]
-    lines += [f"<ul>{notes}</ul>"] if notes else []
+    lines += [f"<ul>{''.join(f'<li>{escape(note)}</li>' for note in notes)}</ul>"] if notes else []
     for run in runs:
         packages = run.versions.get("packages") or {}
         parts = [f"{name} {version}" for name, version in packages.items()]

@@ -3,21 +3,87 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import read_yaml
-from sb3_tbc.report.runs import SHIPPED, Results
-from sb3_tbc.zoo.config import OF_PAPER
+from sb3_tbc.report.runs import SHIPPED, Results, Run
+from sb3_tbc.zoo.config import OF_PAPER, load_config
 
 CAMPAIGN = "campaign.yml"
 """In the folder of results: ``first_seed``, ``options`` of every command, and ``runs`` with task, methods, seeds, and
 ``first_seed`` and ``options`` of their own."""
+N_EVAL_EPISODES = 20
+"""Episodes in an evaluation along the curve, where the plan does not say: the default of ``sb3_tbc.train``."""
+
+
+class Planned(NamedTuple):
+    """One row of the report as it is planned."""
+
+    task: str
+    method: str
+    seeds: range
+    n_timesteps: int | None  # None: those of the shipped settings
+    options: list[str]
+
+    @property
+    def config(self) -> str | None:
+        """Which settings are asked for by name."""
+        return "paper" if self.method.endswith(OF_PAPER) else None
+
+    @property
+    def ablation(self) -> str | None:
+        """What is left out or put in."""
+        name = self.method.partition(" ")[2].removesuffix(OF_PAPER)
+        return name if name not in ("", SHIPPED) else None
+
+    @property
+    def algo(self) -> str:
+        """The algorithm."""
+        return self.method.partition(" ")[0]
+
+    def evaluated(self) -> dict[str, int]:
+        """Steps of training, steps between evaluations and episodes in each, under their names in ``config.yml``."""
+        steps = self.n_timesteps or _shipped_steps(self.algo, self.task, self.config, self.ablation)
+        freq, episodes = self._option("--eval-freq"), self._option("--n-eval-episodes")
+        counts = {"eval_freq": freq or eval_freq_of(steps), "n_eval_episodes": episodes or N_EVAL_EPISODES}
+        return {"n_timesteps": steps, **counts}
+
+    def _option(self, name: str) -> int:
+        return int(self.options[self.options.index(name) + 1]) if name in self.options else 0
+
+    def done_by(self, run: Run) -> bool:
+        """Whether a run is one of these; what it does not say of itself is taken to be so."""
+        return run.seed in self.seeds and all(run.config.get(k, v) == v for k, v in self.evaluated().items())
+
+    def command(self) -> str:
+        """The command that makes the runs."""
+        words = ["python", "-m", "sb3_tbc.reproduce", "--tasks", self.task, "--algos", self.algo]
+        words += ["--first-seed", str(self.seeds.start), "--seeds", str(len(self.seeds))]
+        words += ["--config", self.config] if self.config else []
+        words += ["--ablation", self.ablation] if self.ablation else []
+        words += ["--n-timesteps", str(self.n_timesteps)] if self.n_timesteps else []
+        return shlex.join([*words, *self.options])
+
+
+@cache
+def _shipped_steps(algo: str, task: str, config: str | None, ablation: str | None) -> int:
+    return load_config(algo, task, config, ablation=ablation).n_timesteps
+
+
+def eval_freq_of(n_timesteps: int) -> int:
+    """Steps between evaluations where the plan does not say: the default of ``sb3_tbc.train``."""
+    return max(n_timesteps // 40, 500)
 
 
 def missing_table(root: Path, results: Results) -> list[list[str]]:
     """Planned rows with missing seeds: how many are finished, and the command for the others; without a plan a header.
+
+    A run that was trained or evaluated otherwise than planned does not count.
 
     :raises ConfigError: if the plan cannot be read
     """
@@ -26,50 +92,43 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
     if not path.is_file():
         return table
     try:
-        plan = read_yaml(path)
-        _check_equal_options(plan)
-        for row in plan["runs"]:
-            first = _first_seed(plan, row)
-            for method in row["methods"]:
-                wanted = set(range(first, first + int(row["seeds"])))
-                done = wanted & {run.seed for run in results.get(row["task"], {}).get(method, [])}
-                if done != wanted:
-                    count = f"{len(done)} of {len(wanted)}"
-                    table.append([row["task"], method, count, _command(plan, row, method)])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ConfigError(f"cannot read the plan {path}: {error!r}") from error
+        rows = list(_rows(read_yaml(path)))
+        _check_equal(rows)
+        for row in rows:
+            done = sum(map(row.done_by, results.get(row.task, {}).get(row.method, [])))
+            if done < len(row.seeds):
+                table.append([row.task, row.method, f"{done} of {len(row.seeds)}", row.command()])
+    except (KeyError, IndexError, AttributeError, TypeError, ValueError, OverflowError) as error:
+        said = error if isinstance(error, ConfigError) else repr(error)
+        raise ConfigError(f"cannot read the plan {path}: {said}") from error
     return table
 
 
-def _first_seed(plan: Plain, row: Plain) -> int:
-    return int((row if "first_seed" in row else plan)["first_seed"])
+def _rows(plan: Plain) -> Iterator[Planned]:
+    for row in plan["runs"]:
+        first, count = int((row if "first_seed" in row else plan)["first_seed"]), int(row["seeds"])
+        options = [str(word) for word in (row if "options" in row else plan).get("options") or ()]
+        steps = int(row["n_timesteps"]) if "n_timesteps" in row else None
+        for method in row["methods"]:
+            yield Planned(str(row["task"]), str(method), range(first, first + count), steps, options)
 
 
-def _options(plan: Plain, row: Plain) -> list[str]:
-    return [str(word) for word in (row if "options" in row else plan).get("options") or ()]
-
-
-def _check_equal_options(plan: Plain) -> None:
+def _check_equal(rows: list[Planned]) -> None:
     """Refuse a plan in which methods of one task would be evaluated in different ways.
 
     :raises ConfigError: naming the task
     """
-    first: dict[str, list[str]] = {}
-    for row in plan["runs"]:
-        options = first.setdefault(str(row["task"]), _options(plan, row))
-        if options != _options(plan, row):
+    first: dict[str, Planned] = {}
+    for row in rows:
+        other = first.setdefault(row.task, row)
+        if other.options != row.options:
             raise ConfigError(
-                f"rows of {row['task']} have different options, {shlex.join(options)!r} and "
-                f"{shlex.join(_options(plan, row))!r}; all methods of a task must be evaluated alike"
+                f"rows of {row.task} have different options, {shlex.join(other.options)!r} and "
+                f"{shlex.join(row.options)!r}; all methods of a task must be evaluated alike"
             )
-
-
-def _command(plan: Plain, row: Plain, method: str) -> str:
-    algo, _, variant = method.partition(" ")
-    words = ["python", "-m", "sb3_tbc.reproduce", "--tasks", row["task"], "--algos", algo]
-    words += ["--first-seed", str(_first_seed(plan, row)), "--seeds", str(row["seeds"])]
-    ablation, paper = variant.removesuffix(OF_PAPER), variant.endswith(OF_PAPER)
-    words += ["--config", "paper"] if paper else []
-    words += ["--ablation", ablation] if ablation not in ("", SHIPPED) else []
-    words += ["--n-timesteps", str(row["n_timesteps"])] if "n_timesteps" in row else []
-    return shlex.join([*words, *_options(plan, row)])
+        freqs = [each.evaluated()["eval_freq"] for each in (other, row)]
+        if freqs[0] != freqs[1]:
+            raise ConfigError(
+                f"{row.task} is evaluated every {freqs[0]} steps with {other.method} and every {freqs[1]} with "
+                f"{row.method}; all methods of a task must be evaluated alike: give --eval-freq in the options"
+            )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -17,8 +18,9 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json, read_text, read_yaml
 from sb3_tbc.report.checked import check_final, check_sections
 from sb3_tbc.zoo.callbacks import EvaluationRow
-from sb3_tbc.zoo.config import OF_PAPER
+from sb3_tbc.zoo.config import OF_PAPER, merge
 from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
+from sb3_tbc.zoo.schema import CONFIG_CLASSES
 
 OURS = "tbc-hrl"
 SHIPPED = "full"
@@ -27,6 +29,9 @@ DESCRIPTIONS = "descriptions.yml"
 """File in the folder of results: task -> method -> one line; under ``default``: variant -> one line."""
 TUNING_SEEDS = "tuning_seeds.yml"
 """File in the folder of results: task -> method -> seeds on which the row's settings were chosen."""
+
+BEGIN_ALIKE = ("Drawbridge",)
+"""Tasks in which nothing is random: a deterministic agent repeats its first episode, so others tell nothing more."""
 
 
 class Curve(NamedTuple):
@@ -50,8 +55,12 @@ class Run(NamedTuple):
     @property
     def method(self) -> str:
         """The algorithm, with the variant if it is not the shipped one."""
-        algo, variant = str(self.final["algo"]), str(self.final["variant"])
-        return algo if variant == SHIPPED else f"{algo} {variant}"
+        return method_name(str(self.final["algo"]), str(self.final["variant"]))
+
+    @property
+    def settings(self) -> Plain:
+        """Settings of the agent, with the defaults of those that the run did not give."""
+        return with_defaults(str(self.final["algo"]), self.config.get("model") or {})
 
     @property
     def curve(self) -> Curve:
@@ -65,8 +74,9 @@ class Run(NamedTuple):
 
     @property
     def episodes(self) -> int:
-        """Episodes of the final evaluation, 0 if they were not recorded."""
-        return int(self.final.get("n_episodes") or 0)
+        """Episodes of the final evaluation that differ from each other, 0 if they were not recorded."""
+        count = int(self.final.get("n_episodes") or 0)
+        return min(count, 1) if self.final["task"] in BEGIN_ALIKE else count
 
     @property
     def outcomes(self) -> list[int] | None:
@@ -85,6 +95,27 @@ class Run(NamedTuple):
         return self.commit.endswith("+") or self.commit == "unknown"
 
 
+def method_name(algo: str, variant: str) -> str:
+    """The algorithm, with the variant if it is not the shipped one."""
+    return algo if variant == SHIPPED else f"{algo} {variant}"
+
+
+def row_of(folder: Path) -> tuple[str, str]:
+    """Task and method of a run's folder."""
+    task, algo, variant, _ = folder.parts[-4:]
+    return task, method_name(algo, variant)
+
+
+def with_defaults(algo: str, model: PlainMapping) -> Plain:
+    """Settings with the defaults of those that are not given. They are not checked: names may have gone since."""
+    return merge(_defaults(algo), {name: value for name, value in model.items() if name != "policy"})
+
+
+@cache
+def _defaults(algo: str) -> Plain:
+    return CONFIG_CLASSES[algo]().to_dict() if algo in CONFIG_CLASSES else {}
+
+
 Results = dict[str, dict[str, list[Run]]]
 """Task -> method -> runs, one per seed."""
 
@@ -94,7 +125,7 @@ def load_results(root: Path) -> Results:
 
     Seeds on which settings were chosen are left out if their row has other seeds, because they would bias it.
 
-    :raises ConfigError: if there is no run, or one cannot be read
+    :raises ConfigError: if there is no run, or one or the table of these seeds cannot be read
     """
     results: Results = defaultdict(lambda: defaultdict(list))
     for folder in finished_runs(root):
@@ -103,18 +134,29 @@ def load_results(root: Path) -> Results:
             results[str(run.final["task"])][run.method].append(run)
         except (KeyError, ValueError, TypeError) as error:
             raise ConfigError(f"cannot read the run in {folder.path}: {error}") from error
+    if not results and (failed := failed_runs(root)):
+        raise ConfigError(f"no finished runs below {root}, and {len(failed)} that failed, e.g. {failed[0]}/failed.json")
     if not results:
         raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
-    tuned = read_table(root / TUNING_SEEDS)
+    tuned = _tuning_seeds(root / TUNING_SEEDS)
     return {
-        task: {m: _reported(methods[m], tuned.get(task, {}).get(m, ())) for m in sorted(methods, key=_rank)}
+        task: {m: _reported(methods[m], tuned.get((task, m), ())) for m in sorted(methods, key=_rank)}
         for task, methods in sorted(results.items())
     }
 
 
-def _reported(runs: Sequence[Run], tuned_on: Iterable[int]) -> list[Run]:
+def _tuning_seeds(path: Path) -> dict[tuple[str, str], list[int]]:
+    for task, rows in (table := read_table(path)).items():
+        for method, seeds in rows.items():
+            if not isinstance(seeds, list) or not all(type(seed) is int for seed in seeds):
+                raise ConfigError(
+                    f"{path}: {task}, {method} must be a list of seeds, as [0, 10], got {one_line(repr(seeds))}"
+                )
+    return {(task, method): seeds for task, rows in table.items() for method, seeds in rows.items()}
+
+
+def _reported(runs: Sequence[Run], chosen: Collection[int]) -> list[Run]:
     """Runs of a row in order of their seeds; seeds on which settings were chosen only if there are no others."""
-    chosen = set(tuned_on)
     marked = [run._replace(tuned_on=run.seed in chosen) for run in sorted(runs, key=lambda run: run.seed)]
     return [run for run in marked if not run.tuned_on] or marked
 
@@ -165,6 +207,11 @@ def reference_of(method: str) -> str:
 def successes(runs: Sequence[Run]) -> list[float]:
     """Final success rate of each seed."""
     return [float(run.final["success_rate"]) for run in runs]
+
+
+def stable_shares(runs: Sequence[Run]) -> list[float]:
+    """Share of evaluations at 0.9 or more from the first of them on, of each seed that was evaluated; 0 without one."""
+    return [float(run.final.get("stable_share") or 0.0) for run in runs if run.rows]
 
 
 def load_descriptions(root: Path) -> dict[str, dict[str, str]]:

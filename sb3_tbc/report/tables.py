@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from sb3_tbc import stats
 from sb3_tbc.report.comparisons import Row, against_ablations, against_baselines, interval_of
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.paper import Paper
-from sb3_tbc.report.runs import OURS, Results, Run, describe, reference_of, shipped, successes
+from sb3_tbc.report.runs import OURS, Results, Run, describe, reference_of, row_of, shipped, stable_shares, successes
 
 Table = list[list[str]]
 Descriptions = Mapping[str, Mapping[str, str]]
@@ -22,11 +23,11 @@ HEADER = (
 NOTES = (
     "Success: share of the final evaluation's episodes, mean over seeds. Interval: with three seeds or more a "
     "bootstrap over seeds (10,000 resamples), widened where needed to the exact interval over episodes "
-    "(Clopper-Pearson); with one or two seeds the exact interval alone, which holds for these agents and not for "
-    "other seeds. Length: mean steps of successful episodes. Subgoals: share of windows that reached theirs. Window: "
-    "mean executed length in steps. To 0.9: steps until an evaluation first succeeds in 0.9 of its episodes. Stable: "
-    "share of evaluations at 0.9 or more from then on, mean over seeds. Worst: the lowest of these evaluations, of "
-    "all seeds."
+    "(Clopper-Pearson; of episodes that begin alike, one per seed); with one or two seeds the exact interval alone, "
+    "which holds for these agents and not for other seeds. Length: mean steps of successful episodes. Subgoals: share "
+    "of windows that reached theirs. Window: mean executed length in steps. To 0.9: steps until an evaluation first "
+    "succeeds in 0.9 of its episodes. Stable: share of evaluations at 0.9 or more from then on, 0 for a seed without "
+    "one, mean over seeds. Worst: the lowest of these evaluations, of all seeds."
 )
 DEPARTURE_NOTES = (
     "Settings of tbc-hrl that differ between --config paper (its tables and text) and --config tuned (shipped). "
@@ -38,6 +39,10 @@ COMPARISON_NOTES = (
     "side, nor where no seed differs from another. Better: probability that a run of ours beats one of theirs, ties "
     "counted half. Steps saved: to the common threshold, 0.9 of the best mean success of any method on the task, "
     "where that is 0.5 or more; evaluations are far apart, so small differences mean little."
+)
+OVERALL_NOTES = (
+    "Shipped settings; mean of the middle half of all runs. Tasks weigh the same, however many seeds they have; seeds "
+    "are resampled within them. Only rows of the same tasks can be compared."
 )
 
 
@@ -63,7 +68,7 @@ def _success_row(task: str, method: str, runs: Sequence[Run]) -> list[str]:
         mean_of(runs, "subgoal_success", "{:.2f}"),
         mean_of(runs, "mean_window", "{:.1f}"),
         steps_to_90(runs),
-        mean_of(runs, "stable_share", "{:.2f}"),
+        f"{np.mean(shares):.2f}" if (shares := stable_shares(runs)) else "-",
         worst(runs),
     ]
 
@@ -139,17 +144,24 @@ def _steps(runs: Sequence[Run]) -> str:
     return " or ".join(f"{count:,}" for count in steps) or "-"
 
 
-def description_table(task: str, methods: Mapping[str, Sequence[Run]], descriptions: Descriptions) -> Table:
+def description_table(
+    task: str, methods: Mapping[str, Sequence[Run]], descriptions: Descriptions, failed: Sequence[Path]
+) -> Table:
     """Description of each row of a task, with its steps, minutes, machine and notes."""
     table = [["method", "what it is", "steps", "minutes", "machine", "notes"]]
     for method, runs in methods.items():
         minutes = [run.final["wall_time"] / 60 for run in runs if run.final.get("wall_time")]
         machines = sorted({str(run.versions.get("cpu")) for run in runs if run.versions.get("cpu")})
-        notes = notes_of_row(runs, methods)
+        notes = notes_of_row(runs, methods, failed)
         cells = [describe(descriptions, task, method) or "-", _steps(runs)]
         cells += [f"{np.mean(minutes):.0f}" if minutes else "-", ", ".join(machines) or "-", "; ".join(notes) or "-"]
         table.append([method, *cells])
     return table
+
+
+def failed_table(failed: Sequence[Path]) -> Table:
+    """Runs that ended in an error, by their folders."""
+    return [["task", "method", "folder"], *([*row_of(path), "/".join(path.parts[-4:])] for path in failed)]
 
 
 def spread_table(results: Results) -> Table:
@@ -169,16 +181,22 @@ def overall_table(results: Results) -> Table:
     several = len(results) > 1
     names = list(dict.fromkeys(m for methods in results.values() for m in shipped(methods))) if several else []
     for method in names:
-        rows = [methods[method] for methods in results.values() if method in methods]
-        iqm = stats.interquartile_mean([successes(runs) for runs in rows])
+        rows = {task: methods[method] for task, methods in results.items() if method in methods}
+        iqm = stats.interquartile_mean([successes(runs) for runs in rows.values()])
         low, high = iqm.low, iqm.high
-        middle = sum(run.episodes for runs in rows for run in runs) // 2  # episodes of the middle half of the runs
-        if middle:  # runs that all succeed would give an interval of width zero
+        if middle := _episodes_of_middle_half(list(rows.values())):
             exact = stats.clopper_pearson(round(iqm.mean * middle), middle)
             low, high = min(low, exact[0]), max(high, exact[1])
-        counts = [str(len(rows)), str(sum(map(len, rows)))]
+        tasks = "all" if len(rows) == len(results) else ", ".join(rows)
+        counts = [tasks, str(sum(map(len, rows.values())))]
         table.append([method, *counts, f"{iqm.mean:.3f}", f"{low:.3f} to {high:.3f}"])
     return table
+
+
+def _episodes_of_middle_half(rows: Sequence[Sequence[Run]]) -> int:
+    """Episodes that would tell as much if all weighed the same: runs that all succeed are no interval of width zero."""
+    runs = [(run.episodes, 1.0 / (len(rows) * len(row))) for row in rows for run in row]
+    return int(0.5 / sum(weight**2 / count for count, weight in runs)) if all(count for count, _ in runs) else 0
 
 
 def conditions_table(results: Results) -> Table:

@@ -71,6 +71,8 @@ def read_evaluations(path: Path) -> list[EvaluationRow]:
 
 def _parse_row(row: dict[str, str]) -> EvaluationRow:
     values = {name: float(text) for name, text in row.items()}
+    if not 0.0 <= values["success_rate"] <= 1.0:
+        raise ValueError(f"success_rate must lie in [0, 1], got {values['success_rate']}")
     steps, episodes = int(values.pop("timesteps")), int(values.pop("episodes"))
     return EvaluationRow(timesteps=steps, episodes=episodes, **values)
 

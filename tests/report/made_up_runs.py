@@ -66,5 +66,5 @@ def small_ledger(root: Path) -> None:
     (failed / "failed.json").write_text("{}")
     (root / "descriptions.yml").write_text("Pendulum:\n  tbc-hrl: as it is | shipped\n")
     (root / "tuning_seeds.yml").write_text("Drawbridge:\n  hits: [100, 101, 102]\n")
-    rows = "  - {task: Pendulum, seeds: 4, methods: [tbc-hrl, hac]}\n"
+    rows = "  - {task: Pendulum, seeds: 4, n_timesteps: 4000, methods: [tbc-hrl, hac]}\n"
     (root / "campaign.yml").write_text(f"first_seed: 100\noptions: [--n-eval-episodes, '10']\nruns:\n{rows}")

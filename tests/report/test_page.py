@@ -173,6 +173,30 @@ def test_failed_runs_are_counted_and_named(ledger: Path, tmp_path: Path, capsys:
     assert "Pendulum/sac/full/seed_0" in page.read_text()
 
 
+def test_failed_runs_stand_in_the_markdown_and_beside_their_row(ledger: Path, tmp_path: Path) -> None:
+    for name in ("sac/full/seed_0", "hits/full/seed_7"):
+        (ledger / "Pendulum" / name).mkdir(parents=True)
+        (ledger / "Pendulum" / name / "failed.json").write_text("{}")
+    page = tmp_path / "page.md"
+    page.write_text("<!-- results:begin -->\n<!-- results:end -->\n")
+    assert report.main([str(ledger), "--update", str(page)]) == 0
+    text = page.read_text()
+    assert "## Failed" in text
+    assert [line.split()[-2] for line in text.splitlines() if line.startswith("| Pendulum | sac ")] == [
+        "Pendulum/sac/full/seed_0"
+    ]
+    (row,) = [line for line in text.splitlines() if line.startswith("| hits")]
+    assert row.endswith("| 1 failed |")
+
+
+def test_a_ledger_of_failed_runs_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    failed = tmp_path / "Pendulum" / "sac" / "full" / "seed_0" / "failed.json"
+    failed.parent.mkdir(parents=True)
+    failed.write_text("{}")
+    assert report.main([str(tmp_path)]) == 2
+    assert f"and 1 that failed, e.g. {failed}" in capsys.readouterr().err
+
+
 def test_curves_as_one_table(ledger: Path, tmp_path: Path) -> None:
     out = tmp_path / "curves.csv"
     assert report.main([str(ledger), "--curves", str(out)]) == 0

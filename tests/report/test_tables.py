@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from made_up_runs import fake_run
+from sb3_tbc.tasks import make_task
 
+from sb3_tbc import train
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.report import tables
 from sb3_tbc.report.claims import HOLDS, SAME, claims
@@ -25,9 +29,11 @@ from sb3_tbc.report.comparisons import (
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.departures import departures_of, departures_table
 from sb3_tbc.report.paper import load_paper
-from sb3_tbc.report.planned import missing_table
-from sb3_tbc.report.runs import Curve, describe, load_descriptions, load_results, on_union_of_steps
+from sb3_tbc.report.planned import N_EVAL_EPISODES, eval_freq_of, missing_table
+from sb3_tbc.report.runs import BEGIN_ALIKE, Curve, describe, load_descriptions, load_results, on_union_of_steps
 from sb3_tbc.reproduce import jobs
+from sb3_tbc.train import default_eval_freq
+from sb3_tbc.zoo.config import load_config, merge
 
 ROOT = Path(__file__).parents[2]
 
@@ -63,8 +69,26 @@ def test_seeds_that_all_succeed_leave_some_doubt(tmp_path: Path) -> None:
     assert row_of(tmp_path, "tbc-hrl")["95 % interval"] == "0.993 to 1.000"
     fake_run(tmp_path, "B", "tbc-hrl", 0, 1.0)
     overall = tables.overall_table(load_results(tmp_path))[1]
-    assert overall[:4] == ["tbc-hrl", "2", "6", "1.000"]
-    assert overall[-1] == "0.988 to 1.000"
+    assert overall[:4] == ["tbc-hrl", "all", "6", "1.000"]
+    assert overall[-1] == "0.978 to 1.000"
+    fake_run(tmp_path, "B", "sac", 0, 1.0)
+    assert tables.overall_table(load_results(tmp_path))[2][:3] == ["sac", "B", "1"]
+
+
+def test_episodes_that_begin_alike_count_once(tmp_path: Path) -> None:
+    for seed in range(3):
+        fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 1.0)
+    assert row_of(tmp_path, "tbc-hrl")["95 % interval"] == "0.292 to 1.000"
+    methods = load_results(tmp_path)["Drawbridge"]
+    assert notes_of_row(methods["tbc-hrl"], methods) == ["all episodes begin alike: one counts per seed"]
+
+
+@pytest.mark.parametrize("task", ["Drawbridge", "Pendulum", "Platforms", "Tennis2D"])
+def test_which_tasks_begin_alike(task: str) -> None:
+    env = make_task(task)
+    first, second = (env.reset(seed=seed)[0] for seed in (1, 2))
+    alike = all(np.array_equal(first[key], second[key]) for key in first)
+    assert alike == (task in BEGIN_ALIKE)
 
 
 def test_variants_and_ablations_never_are_baselines(tmp_path: Path) -> None:
@@ -128,6 +152,20 @@ def test_comparisons_are_tested_over_seeds_and_corrected_together(tmp_path: Path
     assert verdicts[best, "B"] == f"{SAME} (fewer than three seeds)"
 
 
+def test_seeds_that_never_get_there_are_not_stable(tmp_path: Path) -> None:
+    """A few seeds that learn do not beat a baseline that always does."""
+    for seed in range(5):
+        learns = seed < 2
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0 if learns else 0.3, stable_share=1.0 if learns else None)
+        for other in ("hits", "hac"):
+            fake_run(tmp_path, "A", other, seed, 0.95, stable_share=0.85 + seed / 500)
+    found = [claim for claim in claims(load_results(tmp_path)) if "stably" in claim.text]
+    assert [claim.verdict for claim in found] == [SAME, SAME]
+    assert ["against hac" in found[0].evidence, "against hits" in found[1].evidence] == [True, True]
+    assert "once there, 0 for seeds never there: -0.45" in found[0].evidence
+    assert row_of(tmp_path, "tbc-hrl")["stable"] == "0.40"
+
+
 def test_ablations_are_compared_with_the_full_model(tmp_path: Path) -> None:
     for seed in range(3):
         fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 0.9 + seed / 100)
@@ -160,7 +198,8 @@ def test_unequal_conditions_are_named(tmp_path: Path) -> None:
     for seed in range(2):
         fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, config=ours)
         fake_run(tmp_path, "A", "hits", seed, 1.0, config=theirs)
-        fake_run(tmp_path, "A", "sac", seed, 1.0, config={**ours, "model": {"gradient_ratio": 0.25}})
+        equal = {**ours, "model": {"gradient_ratio": 0.25, "average_decay": 0.999}}
+        fake_run(tmp_path, "A", "sac", seed, 1.0, config=equal)
     results = load_results(tmp_path)
     assert unequal_conditions(results) == {
         "A": {
@@ -173,6 +212,35 @@ def test_unequal_conditions_are_named(tmp_path: Path) -> None:
         }
     }
     assert tables.conditions_table(results)[1][:2] == ["A", "hits"]
+
+
+def test_defaults_are_compared_as_the_values_they_stand_for(tmp_path: Path) -> None:
+    levels = {"high": {"average_decay": 0.999}, "low": {"average_decay": 0.999, "gone_since": 3}, "gradient_ratio": 1}
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0, config={"model": levels})
+    fake_run(tmp_path, "A", "hits", 0, 1.0, config={"model": {"high": {"gradient_ratio": 0.5}}})
+    fake_run(tmp_path, "A", "hac", 0, 1.0, config={"model": {}})
+    fake_run(tmp_path, "A", "sac", 0, 1.0, config={"model": {}})
+    assert unequal_conditions(load_results(tmp_path))["A"] == {
+        "hits": ["high level's updates per step: 0.5 (as the low level's)"],
+        "sac": ["weight averaging: 0.0 (0.999)"],
+    }
+
+
+def test_rows_say_whose_settings_they_do_not_have(tmp_path: Path) -> None:
+    model = load_config("tbc-hrl", "Pendulum").model
+    other = {**model, "kappa": 9.0, "dt_min": 7, "reconsider_margin": 3.0, "fixed_duration": 5.0}
+    for variant, settings in (("full", [model, model]), ("others", [model, {**model, "kappa": 9.0}])):
+        for seed, given in enumerate(settings):
+            fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0, variant, config={"model": given})
+    for task in ("Drawbridge", "Foreign"):
+        given = {**load_config("sac", "Drawbridge").model, "tau": 0.5}
+        fake_run(tmp_path, task, "sac", 0, 1.0, config={"model": given})
+    fake_run(tmp_path, "UR5Reacher", "tbc-hrl", 0, 1.0, config={"model": merge(model, other)})
+    notes = {(t, m): notes_of_row(runs, rows) for t, rows in load_results(tmp_path).items() for m, runs in rows.items()}
+    assert notes["Pendulum", "tbc-hrl"] == notes["Foreign", "sac"] == []
+    assert notes["Pendulum", "tbc-hrl others"] == ["settings differ between seeds: kappa"]
+    assert notes["Drawbridge", "sac"][0] == "not the shipped settings: tau"
+    assert re.fullmatch(r"not the shipped settings: \w+, \w+, \w+ and \d+ more", notes["UR5Reacher", "tbc-hrl"][0])
 
 
 def test_comparisons_say_what_is_unequal_in_ablations_too(tmp_path: Path) -> None:
@@ -238,6 +306,14 @@ def test_tuning_seeds_are_left_out_or_named(tmp_path: Path) -> None:
     assert notes_of_row(methods["tbc-hrl"], methods) == []
 
 
+@pytest.mark.parametrize("seeds", ["0", "", "['0']", "[true]", "{0: 1}"])
+def test_tuning_seeds_that_are_no_seeds(seeds: str, tmp_path: Path) -> None:
+    fake_run(tmp_path, "A", "sac", 0, 1.0)
+    (tmp_path / "tuning_seeds.yml").write_text(f"A:\n  sac: {seeds}\n")
+    with pytest.raises(ConfigError, match=r"tuning_seeds.yml: A, sac must be a list of seeds, as \[0, 10\], got "):
+        load_results(tmp_path)
+
+
 def test_ablations_of_the_papers_settings_are_compared_with_these(tmp_path: Path) -> None:
     for variant, rate, ratio in (("full", 1.0, 0.5), ("full-paper", 0.6, 1.0), ("no-ts", 0.7, 0.5)):
         fake_run(tmp_path, "A", "tbc-hrl", 0, rate, variant, config={"model": {"gradient_ratio": ratio}})
@@ -281,11 +357,12 @@ def test_rows_of_a_plan_may_have_options_of_their_own(tmp_path: Path) -> None:
 
 
 def test_missing_runs_come_with_a_command_that_is_understood(tmp_path: Path) -> None:
+    counts = {"n_timesteps": 500, "eval_freq": 500, "n_eval_episodes": 100}
     for seed in (0, 100):
-        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0)
-    fake_run(tmp_path, "Pendulum", "hits", 100, 1.0)
+        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0, config=counts)
+    fake_run(tmp_path, "Pendulum", "hits", 100, 1.0, config=counts)
     rows = "{task: Pendulum, seeds: 2, n_timesteps: 500, methods: [tbc-hrl, tbc-hrl no-ts, tbc-hrl full-paper]}"
-    rows += ", {task: Pendulum, seeds: 1, methods: [hits]}"
+    rows += ", {task: Pendulum, seeds: 1, n_timesteps: 500, methods: [hits]}"
     (tmp_path / "campaign.yml").write_text(f"first_seed: 100\noptions: [--n-eval-episodes, 100]\nruns: [{rows}]")
     _, *missing = missing_table(tmp_path, load_results(tmp_path))
     assert [row[:3] for row in missing] == [
@@ -301,7 +378,38 @@ def test_missing_runs_come_with_a_command_that_is_understood(tmp_path: Path) -> 
         assert "--n-eval-episodes" in planned[0].arguments
         variants.append(planned[0].target.path.parent.name)
     assert variants == ["full", "no-ts", "full-paper"]
-    (tmp_path / "campaign.yml").write_text("runs: 3")
+    many = f"{{first_seed: 0, runs: [{{task: A, seeds: {10**30}, methods: [sac]}}]}}"
+    for wrong in ("runs: 3", "runs: [options]", many):
+        (tmp_path / "campaign.yml").write_text(wrong)
+        with pytest.raises(ConfigError, match="cannot read the plan"):
+            missing_table(tmp_path, load_results(tmp_path))
+
+
+def test_runs_made_otherwise_than_planned_do_not_count(tmp_path: Path) -> None:
+    planned = {"n_timesteps": 200_000, "eval_freq": 5000, "n_eval_episodes": 20}
+    changes: tuple[dict[str, int], ...] = ({}, {"n_timesteps": 100}, {"eval_freq": 100}, {"n_eval_episodes": 100})
+    for seed, change in enumerate(changes):
+        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0, config={**planned, **change})
+    plan = tmp_path / "campaign.yml"
+    plan.write_text("{first_seed: 0, runs: [{task: Pendulum, seeds: 4, methods: [tbc-hrl]}]}")
+    assert missing_table(tmp_path, load_results(tmp_path))[1][2] == "1 of 4"
+    assert planned["eval_freq"] == default_eval_freq(200_000) == eval_freq_of(200_000)
+    assert default_eval_freq(30) == eval_freq_of(30)
+    assert train.N_EVAL_EPISODES == N_EVAL_EPISODES
+
+
+def test_plans_that_evaluate_a_task_at_other_steps_are_refused(tmp_path: Path) -> None:
+    fake_run(tmp_path, "Pendulum", "tbc-hrl", 0, 1.0)
+    plan = tmp_path / "campaign.yml"
+    rows = (
+        "{task: Pendulum, seeds: 1, methods: [tbc-hrl]}, {task: Pendulum, seeds: 1, n_timesteps: 400, methods: [hac]}"
+    )
+    plan.write_text(f"{{first_seed: 0, runs: [{rows}]}}")
+    with pytest.raises(ConfigError, match="evaluated every 5000 steps with tbc-hrl and every 500 with hac"):
+        missing_table(tmp_path, load_results(tmp_path))
+    plan.write_text(f"{{first_seed: 0, options: [--eval-freq, 500], runs: [{rows}]}}")
+    assert [row[2] for row in missing_table(tmp_path, load_results(tmp_path))[1:]] == ["0 of 1", "0 of 1"]
+    plan.write_text(f"{{first_seed: 0, options: [--eval-freq], runs: [{rows}]}}")
     with pytest.raises(ConfigError, match="cannot read the plan"):
         missing_table(tmp_path, load_results(tmp_path))
 

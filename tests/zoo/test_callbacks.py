@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.zoo import callbacks
 from sb3_tbc.zoo.callbacks import OptionTraceCallback, SuccessEvalCallback, TimedCheckpointCallback, read_evaluations
 
@@ -91,6 +92,14 @@ def test_evaluates_on_time_and_keeps_the_best(agent: Agent, tmp_path: Path, monk
     assert seeds == [4007]
     assert len(read_evaluations(csv_path)) == 5
     assert best.read_text() == "agent at 21"
+
+
+@pytest.mark.parametrize("rate", ["nan", "7.0", "-0.1"])
+def test_success_rates_that_are_none_are_refused(rate: str, tmp_path: Path) -> None:
+    path = tmp_path / "evaluations.csv"
+    path.write_text(",".join(callbacks.EvaluationRow._fields) + f"\n100,{rate},20,1,1,1,1\n")
+    with pytest.raises(ConfigError, match=r"evaluations.csv .*: success_rate must lie in \[0, 1\], got "):
+        read_evaluations(path)
 
 
 def test_of_equally_successful_agents_the_faster_is_kept(agent: Agent) -> None:
