@@ -397,11 +397,12 @@ class TBCHRL(TwoLevelSaving):
                 level._current_progress_remaining = self._current_progress_remaining
                 level.train(updates, config.batch_size)
         self._n_updates = self.low._n_updates
-        if self.reachability is not None and steps:
+        if self.reachability is not None:
             updates = self._owed_updates("reachability", steps / UPDATE_EVERY)
-            self._owed["reachability"] -= updates
-            loss = self.reachability.train_on(self.replay_buffer.low, updates)
-            self.logger.record("reachability/loss", loss)
+            if updates and self.replay_buffer.low.size():
+                self._owed["reachability"] -= updates
+                loss = self.reachability.train_on(self.replay_buffer.low, updates)
+                self.logger.record("reachability/loss", loss)
 
     def _owed_updates(self, name: str, more: float) -> int:
         """Number of whole updates to do now.
