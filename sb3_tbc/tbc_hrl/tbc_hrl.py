@@ -135,8 +135,8 @@ class TBCHRL(TwoLevelSaving):
             level.tau = config.tau
 
     def _change(self, name: str, value: object) -> None:
-        self.config = self.config_class.from_dict({**self.settings, name: value})
-        self.settings = self.config.to_dict()
+        given = self.config_class.from_dict({**self.settings, name: value})
+        self.settings, self.config = given.to_dict(), given.for_episodes_of(self.episode_length)
 
     @property
     def dt_max(self) -> float:
