@@ -104,7 +104,7 @@ class TBCHRL(TwoLevelSaving):
         self._updated_at = 0
         self._counted_to: int | None = None
         self._owed: dict[str, float] = {}  # updates still to be done, by level; may be fractions
-        self._burst_due = False  # an episode was stored since the last updates
+        self._burst_due = 0  # episodes stored since the last updates
         self.stop_requested = False
         self.collector: Collector | None = None
         self._resumed: Plain = {}
@@ -293,7 +293,7 @@ class TBCHRL(TwoLevelSaving):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         if reset_num_timesteps:
-            self._updated_at, self._owed, self._burst_due = 0, {}, False
+            self._updated_at, self._owed, self._burst_due = 0, {}, 0
         elif self._counted_to is not None:
             self._updated_at += self.num_timesteps - self._counted_to  # steps that were not done here owe no updates
         self._counted_to = self.num_timesteps
@@ -326,12 +326,12 @@ class TBCHRL(TwoLevelSaving):
         return self.collector
 
     def _update_if_due(self, log_interval: int | None) -> None:
-        """Update both levels if an episode was stored since the last time."""
+        """Update both levels if an episode was stored since the last time; environments may end several at once."""
         if not self._burst_due:
             return
         self.train()
-        self._burst_due = False
-        if log_interval and self._episode_num % log_interval == 0:
+        before, self._burst_due = self._episode_num - self._burst_due, 0
+        if log_interval and before // log_interval < self._episode_num // log_interval:
             self.dump_logs()
 
     def _prepare_updates(self, total_timesteps: int, bar: ProgressBar | None) -> None:
@@ -371,7 +371,7 @@ class TBCHRL(TwoLevelSaving):
         """Put finished episodes into the replay buffers; updates follow."""
         for episode in episodes:
             self._episode_num += 1
-            self._burst_due = True
+            self._burst_due += 1
             self.diagnostics.add(episode, self.store.add(episode, goal_test))
 
     def _as_sb3_names(self, step: HierarchicalStep) -> Plain:
