@@ -75,7 +75,8 @@ class OptionEnv(CopyableVecEnvWrapper):
         self._actions: FloatArray = np.zeros((venv.num_envs, 0))
 
     def reset(self) -> FloatArray:
-        """Begin an episode everywhere."""
+        """Begin an episode everywhere; weights of the agent that were changed by hand hold from now on."""
+        self.policy.actor.notice_changes()
         observation = cast(GoalObservation, self.venv.reset())
         self.reset_infos = list(self.venv.reset_infos)
         self._seen = {key: np.array(observation[key]) for key in GOAL_KEYS}

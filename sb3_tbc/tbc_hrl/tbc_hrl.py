@@ -316,6 +316,7 @@ class TBCHRL(TwoLevelSaving):
         :param anew: they were just reset
         :param resumed: what was loaded of a saved run
         """
+        self.actor.notice_changes()
         if anew or self.collector is None:
             explore = assembly.exploration(self.config)
             self.collector = Collector(env, self.actor, self.views, self.rules, self.rng, self.schedule, explore,
