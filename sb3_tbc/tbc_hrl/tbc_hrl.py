@@ -92,7 +92,7 @@ class TBCHRL(TwoLevelSaving):
             stats_window_size=others.stats_window_size,
             tensorboard_log=None if others.tensorboard_log is None else str(others.tensorboard_log),
             verbose=others.verbose,
-            device=others.device,
+            device="cpu",  # what SB3 takes auto for, a GPU, is not what it means here
             support_multi_env=True,
             seed=others.seed,
         )
