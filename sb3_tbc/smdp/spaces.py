@@ -104,7 +104,7 @@ class SubgoalSpace:
     ) -> None:
         self.low = np.asarray(low, dtype=np.float64)
         self.high = np.asarray(high, dtype=np.float64)
-        self.thresholds = np.asarray(thresholds, dtype=np.float64)
+        self.thresholds: FloatArray = np.asarray(thresholds, dtype=np.float64)
         self.local_scale = np.asarray(local_scale, dtype=np.float64)
         self.names = tuple(names)
         self.groups = (
