@@ -80,7 +80,7 @@ def build_parser() -> Parser:
     where.add_argument("--checkpoint-minutes", type=float, default=10.0, help="time between checkpoints for --resume")
     where.add_argument("--keep-checkpoint", action="store_true", help="keep the last checkpoint of a finished run")
     machine = parser.add_argument_group("machine")
-    machine.add_argument("--device", default="cpu", help="torch device")
+    machine.add_argument("--device", default="cpu", help="torch device; agents of two levels learn on the CPU alone")
     machine.add_argument("--num-threads", type=positive_int, default=1,
                          help="torch threads; more than one is slower on networks this small")  # fmt: skip
     machine.add_argument("--progress", action=argparse.BooleanOptionalAction,

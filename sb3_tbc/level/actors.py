@@ -28,12 +28,6 @@ from sb3_tbc.level.storage import Block, linear_layers
 if TYPE_CHECKING:
     from sb3_tbc.ndbc import NDBCNet
 
-WIRING_KEYS = (
-    "inter", "command", "motor", "sensory_fanout", "inter_fanout", "recurrent_command_synapses", "motor_fanin", "seed",
-    "sensory_to",
-)  # fmt: skip
-
-
 SQUASH_EPSILON = 1e-6
 """Added inside the logarithm of tanh's derivative, as SB3 does."""
 HALF_LOG_TAU = 0.5 * math.log(2 * math.pi)
@@ -278,6 +272,7 @@ class NDBCActor(MemoryActor):
     def make_net(self, n_inputs: int, n_outputs: int) -> Any:
         """The circuit, a :class:`~sb3_tbc.ndbc.NDBCNet`."""
         from sb3_tbc.ndbc import NDBCNet, NDBCWiring
+        from sb3_tbc.ndbc.wiring import WIRING_KEYS
 
         wiring = NDBCWiring(n_inputs, **{k: v for k, v in self.settings.items() if k in WIRING_KEYS})
         return NDBCNet(n_inputs, n_outputs, wiring, **{k: v for k, v in self.settings.items() if k not in WIRING_KEYS})

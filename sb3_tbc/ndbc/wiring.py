@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import logging
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -263,6 +264,10 @@ class NDBCWiring:
         sizes = f"{self.n_inputs} sensory, {self.inter} inter, {self.command} command, {self.motor} motor"
         reflexes = f", sensory_to={list(self.sensory_to)}" if len(self.sensory_to) > 1 else ""
         return f"NDBCWiring({sizes} neurons, {self.n_synapses} synapses, seed={self.seed}{reflexes})"
+
+
+WIRING_KEYS = tuple(inspect.signature(NDBCWiring).parameters)[1:]
+"""What a wiring takes besides its number of inputs; other settings of a circuit are the network's."""
 
 
 def _fan_out(rng: np.random.Generator, sources: int, targets: int, fan: int, rescue: bool = True) -> NDArray[np.bool_]:

@@ -11,6 +11,7 @@ from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.extras import require
 from sb3_tbc.ndbc import NDBCNet, NDBCWiring
+from sb3_tbc.ndbc.wiring import WIRING_KEYS
 from sb3_tbc.tbc_hrl.level_config import CircuitConfig
 
 CIRCUIT: Plain = {
@@ -27,10 +28,6 @@ CIRCUIT: Plain = {
     "initial_gains": (6.0, 12.0),
 }
 """Settings of the circuit unless given: slow command neurons, since the paper's fast ones forget within one step."""
-OF_WIRING = (
-    "inter", "command", "motor", "sensory_fanout", "inter_fanout", "recurrent_command_synapses", "motor_fanin", "seed",
-    "sensory_to",
-)  # fmt: skip
 
 
 class MemoryCell(nn.Module):
@@ -77,7 +74,7 @@ class NDBCCell(MemoryCell):
     def __init__(self, n_inputs: int, hidden_size: int, scale: list[float], **settings: Any) -> None:
         super().__init__(n_inputs, hidden_size)
         circuit = CircuitConfig.from_dict({**CIRCUIT, "input_scale": tuple(scale), **settings}).to_dict()
-        wiring = NDBCWiring(n_inputs, **{name: circuit.pop(name) for name in OF_WIRING})
+        wiring = NDBCWiring(n_inputs, **{name: circuit.pop(name) for name in WIRING_KEYS})
         self.net = NDBCNet(n_inputs, hidden_size, wiring, **circuit)
         self.state_dim = self.net.state_dim
 

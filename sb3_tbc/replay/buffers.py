@@ -276,8 +276,12 @@ class SubgoalReplayBuffer(RingBuffer):
         return states, taken["next_states"], earlier.reshape(len(at), -1)
 
     def _intact(self, begin: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which windows still have all their rows; the one at the write position is partly overwritten."""
+        """Which windows still have all their rows; the one at the write position is partly overwritten.
+
+        :param begin: their first rows; below 0 where a window ran across the end of a ring, or its first rows were
+            overwritten before what is left of it was loaded into a larger one
+        """
         if not self.full:
-            return np.ones(len(begin), dtype=bool)
+            return np.asarray(begin >= 0)
         offset = (begin - self.pos) % self.buffer_size  # rows between the oldest row and the window's first
         return np.asarray(offset + length <= self.buffer_size)

@@ -155,7 +155,7 @@ class Guard:
                 seen[key][index] = part
             if not dones[index]:
                 fresh, info = self.venv.env_method("reset", indices=[index])[0]
-                _refuse_reset(index, fresh, info, observation)
+                refuse_reset(index, fresh, info)
                 if RESETS in info:
                     told_at_reset = list(self.venv.unwrapped.reset_infos)
                     told_at_reset[index] = info
@@ -181,11 +181,19 @@ class Guard:
             logger.warning(f"{what}. Its episode ends with the step before{more}")
 
 
-def _refuse_reset(index: int, fresh: Any, info: Plain, observation: Plain) -> None:
-    alone = {key: np.asarray(fresh[key])[None] for key in observation}
-    if BAD_STEP in info or not all_finite(*(alone[key] for key in GOAL_KEYS)):
-        told = info.get(BAD_STEP) or not_finite(0, alone)
-        _raise(index, 0, told, alone, None, "A reset cannot be skipped")
+def refuse_reset(index: int, fresh: GoalObservation, info: Plain) -> None:
+    """Refuse an episode that begins badly, about which nothing can be done.
+
+    :param index: of the environment
+    :param fresh: what it shows
+    :param info: what it says
+    :raises EnvironmentFault: if a value has another shape than it should
+    :raises NonFiniteError: if one is not finite
+    """
+    what = info.get(BAD_STEP) or not_finite(0, {key: np.asarray(fresh[key])[None] for key in GOAL_KEYS})
+    if what is not None:
+        kind = EnvironmentFault if BAD_STEP in info else NonFiniteError
+        raise kind(f"{place(index, 0)}: {what}. A reset cannot be skipped")
 
 
 def _raise(

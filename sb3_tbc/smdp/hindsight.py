@@ -324,7 +324,8 @@ class _TransitionSource:
         goals = self.episode.achieved_goal[o.ends[pairs[:, 1]]]
         copies = relabel_goals(self.episode, o.starts[rows], o.durations[rows], goals, self.reward, goal_test, at_end)
         gained = self._charged(copies.rewards, o.actions[rows]) + self.bonus[rows]
-        return self._steps(rows, o.actions[rows], gained, copies.dones, copies.durations, True, goals)
+        dones = copies.dones if self.episode.success else copies.dones | o.dones[rows]  # a failure ends with any goal
+        return self._steps(rows, o.actions[rows], gained, dones, copies.durations, True, goals)
 
     def _charged(self, rewards: FloatArray, actions: FloatArray) -> FloatArray:
         """Rewards less the price of the time budgets in ``actions``."""

@@ -104,7 +104,7 @@ class SubgoalSpace:
     ) -> None:
         self.low = np.asarray(low, dtype=np.float64)
         self.high = np.asarray(high, dtype=np.float64)
-        self.thresholds = np.asarray(thresholds, dtype=np.float64)
+        self.thresholds: FloatArray = np.asarray(thresholds, dtype=np.float64)
         self.local_scale = np.asarray(local_scale, dtype=np.float64)
         self.names = tuple(names)
         self.groups = (
@@ -115,6 +115,8 @@ class SubgoalSpace:
         self.event = event
         self.rotations = tuple(rotations)
         self._check()
+        if len(self.groups) == self.dim:  # each coordinate alone: in their order, in which `reached` compares them
+            self.thresholds, self.groups = self.tolerance, tuple((i,) for i in range(self.dim))
 
     def __reduce__(self) -> tuple[object, ...]:
         """Travel to other processes whatever the maps are: functions without a name of their own go by value."""
@@ -143,7 +145,7 @@ class SubgoalSpace:
             raise ValueError(
                 f"event must be the index of a flag in the observation, counted from 0, got {self.event!r}"
             )
-        if sorted(i for g in self.groups for i in g) != list(range(self.dim)):
+        if not all(self.groups) or sorted(i for g in self.groups for i in g) != list(range(self.dim)):
             raise ValueError(f"groups must use each of the {self.dim} coordinates once, got {self.groups}")
         for index in self.rotations:
             if not 0 <= index < len(self.groups) or len(self.groups[index]) != 4:

@@ -60,7 +60,3 @@ class LevelViews(NamedTuple):
         """Fixed scales that bring the low level's observation to about [-1, 1]."""
         time = [1.0] if self.remaining_time else []
         return np.concatenate([self.subgoals.local_scale, self.subgoals.resolution_scale, time])
-
-
-LevelLayout = LevelViews
-"""Its former name."""

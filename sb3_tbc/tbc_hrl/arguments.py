@@ -78,8 +78,22 @@ def check_device(device: str | th.device) -> None:
 class HierarchyArguments(SB3Arguments):
     """Further arguments of an agent of two levels."""
 
+    device: str | th.device = "cpu"
+    """``cpu``, or ``auto``, which is the same: both levels act and learn on the CPU."""
     subgoals: SubgoalSpace | None = None
     """Subgoal space, for environments without an attribute ``subgoals``."""
+
+    def check(self) -> None:
+        """Refuse every other device.
+
+        :raises SettingError: saying why
+        """
+        if str(self.device) not in ("cpu", "auto"):
+            raise SettingError(
+                "device",
+                f"must be 'cpu', or 'auto', which is the same, got {str(self.device)!r}: both levels act and learn on "
+                "the CPU, where networks of their size are faster",
+            )
 
 
 @dataclass(frozen=True)

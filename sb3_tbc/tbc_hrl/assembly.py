@@ -256,6 +256,9 @@ def make_low_buffer(
 ) -> SubgoalReplayBuffer:
     """Replay of the low level's steps, which draws their hindsight subgoals."""
     own = config.low
+    strategy = own.goal_strategy or config.goal_strategy
+    if strategy == "event":  # it ends windows, and says nothing about the points within one
+        strategy = "future"
     return SubgoalReplayBuffer(
         own.buffer_size,
         ends.observation,
@@ -268,7 +271,7 @@ def make_low_buffer(
         device=device,
         seed=seed,
         reward=reward,
-        hindsight=(own.goal_strategy or config.goal_strategy) if config.low_reward == "step" else "timed",
+        hindsight=strategy if config.low_reward == "step" else "timed",
         sequence_length=config.sequence_length,
         reach_pairs=config.duration == "rule" or config.duration_loss_coef > 0,
     )

@@ -78,10 +78,11 @@ class TwoLevelRunner:
         self.begin(reset_or_name(self.env.venv))  # type: ignore[arg-type]
 
     def begin(self, observation: GoalObservation) -> None:
-        """Begin episodes in environments that were just reset.
+        """Begin episodes in environments that were just reset; weights that were changed by hand hold from now on.
 
         :param observation: what the environments show
         """
+        self.actor.notice_changes()
         self.membrane = self.actor.blank(self.env.num_envs)
         self.observation = self.env.begin(observation)
 

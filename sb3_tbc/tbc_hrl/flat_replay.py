@@ -23,7 +23,8 @@ ARRAYS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
 class TerminatingHerReplayBuffer(HerReplayBuffer):
     """SB3's hindsight replay for tasks that end on success: a relabelled transition that meets its goal is terminal.
 
-    SB3 keeps the flag that was stored, under which the value of standing on a relabelled goal never stops to grow.
+    So is one that ended its episode in failure, as a fall does. SB3 keeps the flag that was stored, under which the
+    value of standing on a relabelled goal never stops to grow.
 
     :param event_goals: take the goal from the step of the task's event (:attr:`SubgoalSpace.event`) for all transitions
         of an episode in which it happened, and leave those of the others as they are
@@ -58,7 +59,12 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
             raise ValueError("hindsight replay needs the environment's goal test; pass env when loading")
         reached = samples.next_observations["achieved_goal"].cpu().numpy()
         wanted = samples.observations["desired_goal"].cpu().numpy()
-        dones = goal_test_of(self.env).terminated(reached, wanted).astype(np.float32)
+        ended = np.flatnonzero(samples.dones.cpu().numpy())
+        first = self.observations["desired_goal"][batch_indices, env_indices][ended]
+        pairs = np.concatenate([reached, reached[ended]]), np.concatenate([wanted, first])
+        met, met_first = np.split(goal_test_of(self.env).terminated(*pairs), [len(reached)])
+        met[ended] |= ~met_first  # a failure ends with any goal
+        dones = met.astype(np.float32)
         return samples._replace(dones=th.from_numpy(dones).reshape(-1, 1).to(self.device))
 
     def add(

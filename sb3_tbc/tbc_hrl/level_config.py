@@ -239,6 +239,7 @@ class LowConfig(LevelConfig):
     n_hindsight_goals: Annotated[float, Range(0, 1e6)] | None = None
     """Number of hindsight subgoals for each transition, may be fractional; null: the agent's ``n_hindsight_goals``."""
     goal_strategy: Literal["future", "episode"] | None = None
-    """Where hindsight subgoals come from; null: as the agent's ``goal_strategy``. For ``low_reward: step`` only."""
+    """Where hindsight subgoals come from; null: as the agent's ``goal_strategy``, but ``future`` where that is
+    ``event``. For ``low_reward: step`` only."""
     policy_kwargs: LowPolicyConfig = LowPolicyConfig()
     """Networks of the level; the circuit among them."""

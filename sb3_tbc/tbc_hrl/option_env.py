@@ -15,8 +15,10 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, FloatArray
 from sb3_tbc.errors import EnvironmentFault, NonFiniteError
 from sb3_tbc.smdp.episode_limit import ANNOUNCE, BAD_STEP, CopyableVecEnvWrapper, LastWindow, with_episode_limit
+from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.finite import not_finite
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
+from sb3_tbc.smdp.guard import refuse_reset
 from sb3_tbc.smdp.options import OptionClock
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.tbc_hrl.foreign_high import refuse_reconsidering
@@ -75,10 +77,17 @@ class OptionEnv(CopyableVecEnvWrapper):
         self._actions: FloatArray = np.zeros((venv.num_envs, 0))
 
     def reset(self) -> FloatArray:
-        """Begin an episode everywhere."""
-        observation = cast(GoalObservation, self.venv.reset())
+        """Begin an episode everywhere; weights of the agent that were changed by hand hold from now on.
+
+        :raises EnvironmentFault: if an environment fails, or shows something of another shape than it should
+        :raises NonFiniteError: if it shows something that is not finite
+        """
+        self.policy.actor.notice_changes()
+        observation = cast(GoalObservation, reset_or_name(self.venv))
         self.reset_infos = list(self.venv.reset_infos)
         self._seen = {key: np.array(observation[key]) for key in GOAL_KEYS}
+        for index, info in enumerate(self.reset_infos):
+            refuse_reset(index, {key: part[index] for key, part in self._seen.items()}, info)
         self._forget(np.arange(self.num_envs))
         return self.policy.views.high(self._seen)
 
@@ -183,6 +192,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         last = {key: self._seen[key][[index]] for key in GOAL_KEYS}
         info["terminal_observation"] = self.policy.views.high(last)[0]
         observation, self.reset_infos[index] = self.venv.env_method("reset", indices=[index])[0]
+        refuse_reset(index, observation, self.reset_infos[index])
         for key in GOAL_KEYS:
             self._seen[key][index] = observation[key]
         self._forget(np.array([index]))

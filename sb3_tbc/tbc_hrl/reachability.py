@@ -89,6 +89,10 @@ class Reachability(nn.Module):
         return float(loss.detach())
 
     def train_on(self, buffer: SubgoalReplayBuffer, updates: int) -> float:
-        """Update on pairs drawn from the low level's replay buffer; the mean loss."""
+        """Update on pairs drawn from the low level's replay buffer; the mean loss.
+
+        :param buffer: may not be empty
+        :param updates: at least 1
+        """
         losses = [self.update(buffer.sample_pairs(BATCH_SIZE, self.horizon, self.rng)) for _ in range(updates)]
-        return float(np.mean(losses)) if losses else float("nan")
+        return float(np.mean(losses))

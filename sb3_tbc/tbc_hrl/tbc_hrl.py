@@ -92,7 +92,7 @@ class TBCHRL(TwoLevelSaving):
             stats_window_size=others.stats_window_size,
             tensorboard_log=None if others.tensorboard_log is None else str(others.tensorboard_log),
             verbose=others.verbose,
-            device=others.device,
+            device="cpu",  # what SB3 takes auto for, a GPU, is not what it means here
             support_multi_env=True,
             seed=others.seed,
         )
@@ -104,7 +104,7 @@ class TBCHRL(TwoLevelSaving):
         self._updated_at = 0
         self._counted_to: int | None = None
         self._owed: dict[str, float] = {}  # updates still to be done, by level; may be fractions
-        self._burst_due = False  # an episode was stored since the last updates
+        self._burst_due = 0  # episodes stored since the last updates
         self.stop_requested = False
         self.collector: Collector | None = None
         self._resumed: Plain = {}
@@ -135,8 +135,8 @@ class TBCHRL(TwoLevelSaving):
             level.tau = config.tau
 
     def _change(self, name: str, value: object) -> None:
-        self.config = self.config_class.from_dict({**self.settings, name: value})
-        self.settings = self.config.to_dict()
+        given = self.config_class.from_dict({**self.settings, name: value})
+        self.settings, self.config = given.to_dict(), given.for_episodes_of(self.episode_length)
 
     @property
     def dt_max(self) -> float:
@@ -293,7 +293,7 @@ class TBCHRL(TwoLevelSaving):
             total_timesteps, callback, reset_num_timesteps, tb_log_name or type(self).__name__, progress_bar
         )
         if reset_num_timesteps:
-            self._updated_at, self._owed, self._burst_due = 0, {}, False
+            self._updated_at, self._owed, self._burst_due = 0, {}, 0
         elif self._counted_to is not None:
             self._updated_at += self.num_timesteps - self._counted_to  # steps that were not done here owe no updates
         self._counted_to = self.num_timesteps
@@ -316,6 +316,7 @@ class TBCHRL(TwoLevelSaving):
         :param anew: they were just reset
         :param resumed: what was loaded of a saved run
         """
+        self.actor.notice_changes()
         if anew or self.collector is None:
             explore = assembly.exploration(self.config)
             self.collector = Collector(env, self.actor, self.views, self.rules, self.rng, self.schedule, explore,
@@ -326,12 +327,12 @@ class TBCHRL(TwoLevelSaving):
         return self.collector
 
     def _update_if_due(self, log_interval: int | None) -> None:
-        """Update both levels if an episode was stored since the last time."""
+        """Update both levels if an episode was stored since the last time; environments may end several at once."""
         if not self._burst_due:
             return
         self.train()
-        self._burst_due = False
-        if log_interval and self._episode_num % log_interval == 0:
+        before, self._burst_due = self._episode_num - self._burst_due, 0
+        if log_interval and before // log_interval < self._episode_num // log_interval:
             self.dump_logs()
 
     def _prepare_updates(self, total_timesteps: int, bar: ProgressBar | None) -> None:
@@ -371,7 +372,7 @@ class TBCHRL(TwoLevelSaving):
         """Put finished episodes into the replay buffers; updates follow."""
         for episode in episodes:
             self._episode_num += 1
-            self._burst_due = True
+            self._burst_due += 1
             self.diagnostics.add(episode, self.store.add(episode, goal_test))
 
     def _as_sb3_names(self, step: HierarchicalStep) -> Plain:
@@ -397,11 +398,12 @@ class TBCHRL(TwoLevelSaving):
                 level._current_progress_remaining = self._current_progress_remaining
                 level.train(updates, config.batch_size)
         self._n_updates = self.low._n_updates
-        if self.reachability is not None and steps:
+        if self.reachability is not None:
             updates = self._owed_updates("reachability", steps / UPDATE_EVERY)
-            self._owed["reachability"] -= updates
-            loss = self.reachability.train_on(self.replay_buffer.low, updates)
-            self.logger.record("reachability/loss", loss)
+            if updates and self.replay_buffer.low.size():
+                self._owed["reachability"] -= updates
+                loss = self.reachability.train_on(self.replay_buffer.low, updates)
+                self.logger.record("reachability/loss", loss)
 
     def _owed_updates(self, name: str, more: float) -> int:
         """Number of whole updates to do now.

@@ -213,8 +213,17 @@ def test_an_agent_of_a_gpu_loads_without_one(algo: str, tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="'cuda' is not there: the agent is loaded on the CPU"):
         loaded = ALGORITHMS[algo].load(tmp_path / "a.zip", env=corridor(), device="cuda")
     assert loaded.device.type == loaded.policy.device.type == "cpu"
-    with pytest.raises(ValueError, match="needs a GPU"):
+    with pytest.raises(ValueError, match="needs a GPU" if algo == "sac" else "both levels act and learn on the CPU"):
         make(algo, device="cuda")
+
+
+@two_levels
+def test_auto_is_the_cpu_where_there_is_a_gpu(algo: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gpu(device: Any) -> th.device:
+        return th.device("meta" if device == "auto" else device)
+
+    monkeypatch.setattr("stable_baselines3.common.base_class.get_device", gpu)
+    assert make(algo, device="auto").device.type == "cpu"
 
 
 @shows("yes", "save_replay_buffer", "load_replay_buffer")

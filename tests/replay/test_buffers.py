@@ -119,6 +119,28 @@ def test_buffer_state_round_trip_and_mismatch() -> None:
         low_buffer(3, 1).extend(low_level_steps(episode(), ENV.subgoals, RULES))
 
 
+@pytest.mark.parametrize("more", [0, 5])
+def test_a_full_ring_goes_on_in_a_larger_one(more: int) -> None:
+    """Episodes are told apart by their serial number; what was sampled of a window belongs to it."""
+    old, new = (low_buffer(size, 1e9, sequence_length=3, reach_pairs=True) for size in (13, 13 + more))
+    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    marked = [steps._replace(local=steps.local * 0 + n, states=steps.states * 0 + n) for n in range(1, 8)]
+    for part in marked[:6]:
+        old.extend(part)
+    new.set_state(old.get_state())
+    assert (old.pos, new.size(), new.full) == (4, 13, not more)
+    for serials in ({4.0, 5.0, 6.0}, {4.0, 5.0, 6.0, 7.0} if more else {5.0, 6.0, 7.0}):
+        at, where, second = new._timed(np.arange(13).repeat(40))
+        assert len(where) > 300
+        np.testing.assert_array_equal(new.data["local"][at[where], 0], new.data["local"][second, 0])
+        batch = new.sample_burst(1, 500)
+        assert set(batch.observations[0, :, 0].tolist()) == serials
+        np.testing.assert_array_equal(batch.states[0, :, 0], batch.observations[0, :, 0])  # before what is unrolled
+        pairs = new.sample_pairs(500, 4, np.random.default_rng(0))
+        np.testing.assert_allclose((pairs.goal - pairs.here)[:, 0], 0.1 * pairs.steps, atol=1e-6)
+        new.extend(marked[6])
+
+
 def test_dense_reward_of_relabelled_steps() -> None:
     buffer = low_buffer(100, 1e9, reward=LowLevelReward("dense", ENV.subgoals, RULES))
     buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from corridor import Corridor, achieved, local
 
-from sb3_tbc import TBCHRL
+from sb3_tbc import HAC, TBCHRL
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.smdp.hindsight import check_goal_strategy, goal_pairs
 from sb3_tbc.smdp.options import TerminationReason
@@ -37,9 +37,9 @@ class Bell(Corridor):
         return {**observation, "observation": np.append(observation["observation"], rang)}
 
 
-def make(env: Any, **settings: Any) -> TBCHRL:
+def make(env: Any, algo: type[TBCHRL] = TBCHRL, **settings: Any) -> TBCHRL:
     defaults = {"high": LEVEL, "low": LEVEL, "max_options": 30, "dt_max": 12.0, "compile": False, "seed": 0}
-    return TBCHRL("MultiInputPolicy", env, **{**defaults, "gradient_ratio": 0.02, **settings})
+    return algo("MultiInputPolicy", env, **{**defaults, "gradient_ratio": 0.02, **settings})
 
 
 @pytest.mark.parametrize("window_end", ["timed", "reached"])
@@ -77,6 +77,13 @@ def test_all_options_get_the_events_outcome_as_their_goal() -> None:
     rng = np.random.default_rng(0)
     assert goal_pairs(4, 3, "event", rng, 2).tolist() == [[0, 2], [1, 2], [2, 2], [3, 2]]
     assert goal_pairs(4, 3, "event", rng, None).shape == (0, 2)
+
+
+def test_hac_takes_the_low_levels_goals_from_the_future() -> None:
+    """An event gives goals to the high level alone."""
+    model = make(Bell(), HAC, goal_strategy="event")
+    assert model.store.hindsight.goal_strategy == "event"
+    assert model.replay_buffer.low.hindsight == "future"
 
 
 @pytest.mark.parametrize("rings", [True, False])

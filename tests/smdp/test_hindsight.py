@@ -249,6 +249,24 @@ def test_goals_of_an_event() -> None:
     assert len(steps(episode()._replace(observation=flags)).rewards) == len(happened.rewards) - 2
 
 
+@pytest.mark.parametrize("goals_met", ["passing", "end"])
+@pytest.mark.parametrize(
+    ("terminated", "success", "over"), [(True, False, True), (True, True, False), (False, False, False)]
+)
+def test_a_failure_ends_with_any_goal(goals_met: str, terminated: bool, success: bool, over: bool) -> None:
+    """The last option stays as it ended; the success of another goal would not have ended the episode."""
+    reward = HighLevelReward("smdp", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
+    settings = HindsightSettings(40, "episode", -5.0, keep_original=False, goals_met=goals_met)
+    of, rng = episode()._replace(terminated=terminated, success=success), np.random.default_rng(0)
+    steps = high_level_steps(of, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, rng)
+    copies = np.arange(len(steps.dones)) > 2  # behind a failed test and the two options
+    elsewhere = copies & np.isclose(steps.observations[:, 0], 0.3)  # a goal that only the first option met
+    last = np.isclose(steps.observations[:, 1], 0.3)
+    assert {*steps.dones[elsewhere & last]} == {over}
+    assert {*steps.dones[elsewhere & ~last]} == {True}
+    assert {*steps.dones[copies & ~elsewhere & ~last]} == {False}
+
+
 def test_decisions_meet_hindsight_goals_at_their_end() -> None:
     """With a reward per decision a goal that the window only passes is not met, whatever ``goals_met`` says."""
     there_and_on = np.array([0.0, 0.2, 0.5, 0.3, 0.4, 0.2])

@@ -89,6 +89,25 @@ def test_relabelled_transitions_that_meet_their_goal_are_terminal() -> None:
     assert th.equal(samples.rewards, reached.float() - 1)
 
 
+class Pit(Corridor):
+    """Whoever comes below -0.2 falls, which ends the episode without success."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, *rest = super().step(action)
+        return observation, reward, terminated or self.position < -0.2, *rest
+
+
+def test_relabelled_falls_are_terminal() -> None:
+    settings = {"buffer_size": 500, "learning_starts": 1000, "goal_strategy": "episode", "seed": 0}
+    buffer = FlatSAC("MultiInputPolicy", Pit(20, goal=0.9), **settings).learn(400).replay_buffer
+    rows = np.flatnonzero(buffer.ep_length[:, 0])  # of whole episodes
+    fell = buffer.next_observations["achieved_goal"][rows, 0] < -0.2
+    samples = buffer._get_virtual_samples(rows, np.zeros_like(rows))
+    met = (samples.next_observations["achieved_goal"] - samples.observations["desired_goal"]).abs().numpy() <= 0.05
+    assert 0 < (fell & ~met).sum() < met.sum() < len(rows)
+    np.testing.assert_array_equal(samples.dones.bool().numpy(), met | fell)
+
+
 def test_flat_replay_resumes_from_plain_arrays(tmp_path: Path) -> None:
     model = make_flat().learn(300)
     model.save(tmp_path / "model.zip")

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 import torch as th
 from corridor import Corridor
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from sb3_tbc import TBCHRL, SubgoalSpace, TBCPolicy
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.tbc_hrl.evaluation import evaluate_hierarchical
+from sb3_tbc.tbc_hrl.option_env import OptionEnv
 
 LEVEL: dict[str, Any] = {"batch_size": 16, "buffer_size": 2000, "policy_kwargs": {"net_arch": [8, 8]}}
 OBSERVATION = Corridor().reset(seed=0)[0]
@@ -48,6 +50,36 @@ def test_weights_loaded_into_the_policy_act_at_once() -> None:
     assert not np.array_equal(act(taught), act(fresh))
     fresh.policy.load_state_dict(taught.policy.state_dict())
     np.testing.assert_array_equal(act(taught), act(fresh))
+
+
+def evaluated(model: TBCHRL) -> Any:
+    return evaluate_hierarchical(model, Corridor(30), 5, seed=0).mean_window
+
+
+def stepped(model: TBCHRL) -> Any:
+    env = OptionEnv(make_vec_env(lambda: Corridor(30), 1, seed=0), model)
+    env.reset()
+    return env.step(np.ones((1, 2)))[0]
+
+
+def explored(model: TBCHRL) -> Any:
+    model.learn(6, reset_num_timesteps=False)  # no episode ends, so there are no updates
+    low = model.low
+    return low.act(np.ones((1, *low.observation_space.shape)), np.zeros((1, low.state_dim)), True, model.rng)[0]
+
+
+@pytest.mark.parametrize("door", [evaluated, stepped, explored])
+def test_weights_changed_in_place_act_wherever_the_agent_does(door: Any) -> None:
+    model = make()
+    before = door(model)
+    with th.no_grad():
+        for parameter in model.policy.parameters():
+            parameter.mul_(-1.5)
+    after = door(model)
+    assert not np.array_equal(after, before)
+    model.high.refresh()
+    model.low.refresh()
+    np.testing.assert_array_equal(door(model), after)
 
 
 def test_a_policy_is_saved_with_its_agent(tmp_path: Any) -> None:

@@ -157,6 +157,16 @@ def test_steps_before_learning_starts_owe_no_updates() -> None:
     assert model.low._n_updates == model._updated_at - 100
 
 
+@pytest.mark.parametrize("n_envs", [1, 4, 8])
+def test_environments_that_end_together_skip_no_log(n_envs: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = GoalVecEnv([lambda: Corridor(3, goal=5.0) for _ in range(n_envs)])
+    model = TBCHRL("MultiInputPolicy", env, max_options=3, gradient_ratio=0.0, compile=False)
+    logged: list[int] = []
+    monkeypatch.setattr(model, "dump_logs", lambda: logged.append(model._episode_num))
+    model.learn(3 * 80, log_interval=10)
+    assert logged == [-(-n // n_envs) * n_envs for n in range(10, 81, 10)]
+
+
 def test_learning_resets_the_environments_once() -> None:
     resets = [0]
 

@@ -122,6 +122,10 @@ def test_an_agent_takes_its_decisions_from_the_task(tmp_path) -> None:
     agent = make_agent(make("Pendulum"), max_options="auto")
     assert agent.max_options == agent.rules.max_options == 10
     assert agent.rules.dt_max == pytest.approx(agent.episode_length / 10)
+    agent.gradient_ratio = 0.5
+    agent.low_settings["learning_rate"] = 1e-4
+    assert (agent.max_options, agent.config.dt_min) == (10, agent.rules.dt_min)
+    assert agent.settings["max_options"] == "auto"  # as it was given
     agent.save(tmp_path / "agent.zip")
     assert TBCHRL.load(tmp_path / "agent.zip").max_options == 10
 

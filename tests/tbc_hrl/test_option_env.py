@@ -174,6 +174,34 @@ def test_nothing_wrong_gets_through(agent: TBCHRL, missing: bool, words: str) ->
         env.step(np.array([[0.0, 1.0]]))
 
 
+class BadReset(Corridor):
+    """A later reset gives no number, or not the goal that its space has."""
+
+    good, shape = 1, (1,)
+
+    def reset(self, **kwargs: Any) -> Any:
+        observation, info = super().reset(**kwargs)
+        if self.episode > self.good:
+            observation["desired_goal"] = np.full(self.shape, np.nan)
+        return observation, info
+
+
+def act(env: OptionEnv) -> None:
+    for _ in range(6):
+        env.step(np.ones((2, 2)))
+
+
+@pytest.mark.parametrize("good", [0, 1])
+@pytest.mark.parametrize(("shape", "words"), [((1,), "is not finite"), ((2,), "must have shape")])
+def test_no_episode_begins_badly(agent: TBCHRL, good: int, shape: tuple[int, ...], words: str) -> None:
+    env = OptionEnv(DummyVecEnv([Corridor, BadReset]), agent)
+    env.venv.envs[1].unwrapped.good, env.venv.envs[1].unwrapped.shape = good, shape  # type: ignore[attr-defined]
+    if good:
+        env.reset()
+    with pytest.raises((NonFiniteError, EnvironmentFault), match=f"environment 1, reset: .*desired_goal.*{words}"):
+        act(env) if good else env.reset()
+
+
 def test_what_does_not_fit_is_refused(agent: TBCHRL) -> None:
     high = PPO("MlpPolicy", VecNormalize(options(agent)), n_steps=8, batch_size=8)
     with pytest.raises(ValueError, match="trained behind VecNormalize"):

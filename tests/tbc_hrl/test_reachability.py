@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,15 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from scipy.stats import spearmanr
+from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
+from stable_baselines3.common.logger import configure
 from two_windows import LAYOUT, low_buffer
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.smdp.hindsight import low_level_steps
 from sb3_tbc.smdp.options import Episode, Option, OptionRules, TerminationReason
 from sb3_tbc.tbc_hrl.evaluation import evaluate_hierarchical
-from sb3_tbc.tbc_hrl.reachability import Reachability
+from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY, Reachability
 from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
 
 ENV = Corridor()
@@ -172,6 +175,29 @@ def test_estimate_is_saved_with_the_agent(tmp_path: Path) -> None:
     assert loaded.kappa == 0.9
     assert loaded.schedule is not None
     assert loaded.reachability.optimizer.state_dict()["state"]
+
+
+@pytest.mark.parametrize("settings", [{"duration": "rule"}, {"duration_loss_coef": 0.1}])
+def test_learning_goes_on_without_the_replay_buffer(settings: dict[str, Any], tmp_path: Path) -> None:
+    """Its updates wait for the first episode, as those of the levels do for a batch."""
+    model = make(**settings).learn(200, callback=StopTrainingOnMaxEpisodes(2))
+    assert model._burst_due
+    model.save(tmp_path / "model.zip")
+    loaded = TBCHRL.load(tmp_path / "model.zip", env=Corridor())
+    loaded.learn(60, reset_num_timesteps=False)
+    assert loaded._updated_at > model.num_timesteps
+    done = next(iter(loaded.reachability.optimizer.state.values()))["step"]
+    assert done == loaded._updated_at // UPDATE_EVERY
+
+
+def test_episodes_too_short_for_an_update_log_no_loss(tmp_path: Path) -> None:
+    model = make(duration="rule", max_options=3, dt_max=3.0)
+    model.set_env(Corridor(3, goal=5.0))
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(30, log_interval=1)
+    losses = [row["reachability/loss"] for row in csv.DictReader((tmp_path / "progress.csv").open())]
+    assert losses.count("") == 3  # of ten episodes of three steps, with an update for every fourth step
+    assert all(float(loss) > 0 for loss in losses if loss)
 
 
 @pytest.mark.parametrize(("steps", "whole"), [(1, 1), (2.5, 3), (10, 10), (13, 13), (37.037, 38)])

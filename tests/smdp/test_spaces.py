@@ -1,0 +1,33 @@
+"""Subgoal spaces: which points count as reached."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from sb3_tbc.smdp.spaces import SubgoalSpace
+
+
+def make(groups: Sequence[Sequence[int]] | None, thresholds: Sequence[float]) -> SubgoalSpace:
+    return SubgoalSpace.from_slices(
+        [-1, -1], [1, 1], thresholds, local_scale=np.ones(1), names=["x", "y"], groups=groups
+    )
+
+
+@pytest.mark.parametrize(
+    ("groups", "thresholds"), [(None, [0.01, 0.5]), ([[0], [1]], [0.01, 0.5]), ([[1], [0]], [0.5, 0.01])]
+)
+def test_each_coordinate_has_the_threshold_of_its_group(
+    groups: Sequence[Sequence[int]] | None, thresholds: list[float]
+) -> None:
+    space = make(groups, thresholds)
+    points = np.array([[0.1, 0.0], [0.0, 0.1], [0.005, 0.4], [0.0, 0.6]])
+    assert space.tolerance.tolist() == [0.01, 0.5]
+    assert space.reached(points, np.zeros(2)).tolist() == [False, True, True, False]
+
+
+def test_a_group_may_not_be_empty() -> None:
+    with pytest.raises(ValueError, match=r"groups must use each of the 2 coordinates once, got \(\(\), \(0, 1\)\)"):
+        make([[], [0, 1]], [0.1, 0.1])
