@@ -276,23 +276,13 @@ class FlatSAC(PlainAlgorithm, SAC):
         buffer = self._her_buffer()
         arrays = read_arrays(path)
         try:
-            self._take_over(buffer, arrays)
+            buffer.take_over(arrays)
         except (KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path} is no saved replay buffer of such an agent: {error!r}") from error
-        if truncate_last_traj and not resume.can_go_on(self, self._resumed):
-            self.close_running_episodes()
-
-    def _take_over(self, buffer: TerminatingHerReplayBuffer, arrays: Arrays) -> None:
-        rows = len(arrays["actions"])
-        for name, held in buffer.parts().items():
-            if len(arrays[name]) != rows or rows > len(held) or held.shape[1:] != arrays[name].shape[1:]:
-                raise ValueError(f"saved replay buffer does not fit: {name} has shape {arrays[name].shape}")
-        for name, held in buffer.parts().items():
-            held[:rows] = arrays[name]
-        buffer._current_ep_start[:] = arrays["_start"]
-        buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
         more = [name for name in arrays if name.startswith(f"{MORE}.")]
         self._resumed = {name.removeprefix(f"{MORE}."): arrays[name] for name in more}
+        if truncate_last_traj and not resume.can_go_on(self, self._resumed):
+            self.close_running_episodes()
 
     def close_running_episodes(self) -> None:
         """End the running episodes where they are: what was stored of them is used, and they are not continued."""

@@ -124,6 +124,40 @@ def test_other_vectors_begin_new_episodes_and_say_so(tmp_path: Any, caplog: Any)
     assert loaded.replay_buffer is not None
 
 
+def assert_episodes_are_whole(buffer: Any) -> None:
+    """Every row that is sampled lies within its episode, all of whose rows are of the same one of the corridor."""
+    for row, env in zip(*np.nonzero(buffer.ep_length), strict=True):
+        start, length = buffer.ep_start[row, env], buffer.ep_length[row, env]
+        assert (row - start) % buffer.buffer_size < length
+        rows = (start + np.arange(length)) % buffer.buffer_size
+        lived = buffer.observations["observation"][rows, env, 2]
+        assert len(set(lived)) == 1, f"one episode of {length} steps is of several: {lived}"
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("steps", [40, 230])
+@pytest.mark.parametrize("size", [40, 80, 300])
+def test_replay_loads_into_a_larger_buffer(n_envs: int, steps: int, size: int, tmp_path: Any) -> None:
+    model = make(n_envs, buffer_size=80 * n_envs, gradient_ratio=0.0).learn(steps * n_envs)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "replay.npz")
+    env = GoalVecEnv([lambda: Corridor(30)] * n_envs)
+    loaded = FlatSAC.load(tmp_path / "model.zip", env=env, buffer_size=size * n_envs, gradient_ratio=0.02)
+    if size < min(steps, 80):
+        with pytest.raises(ValueError, match="does not fit"):
+            loaded.load_replay_buffer(tmp_path / "replay.npz")
+        return
+    buffer: Any = loaded.replay_buffer
+    buffer.ep_length[:] = 7  # of what was in it before
+    loaded.load_replay_buffer(tmp_path / "replay.npz", truncate_last_traj=False)
+    assert buffer.size() == model.replay_buffer.size()
+    assert (buffer.steps() == model.replay_buffer.steps()).all()
+    assert (buffer.ep_length > 0).sum() == (model.replay_buffer.ep_length > 0).sum() > 0
+    assert_episodes_are_whole(buffer)
+    loaded.learn(200, reset_num_timesteps=False)
+    assert_episodes_are_whole(buffer)
+
+
 class StopAt(BaseCallback):
     def _on_step(self) -> bool:
         self.model.stop_requested |= self.num_timesteps >= 130
