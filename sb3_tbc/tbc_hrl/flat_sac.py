@@ -160,8 +160,9 @@ class FlatSAC(PlainAlgorithm, SAC):
             self._updated_at += self.num_timesteps - self._counted_to  # steps that were not done here owe no updates
         self._counted_to = self.num_timesteps
         record_settings(self, self.settings)
-        if resumed and not resume.set_flat_state(self, self.env, resumed):
-            self.close_running_episodes()
+        relived = bool(resumed) and resume.set_flat_state(self, self.env, resumed)
+        if (anew or resumed) and not relived:
+            self.close_running_episodes()  # hindsight goals are of the same episode
         before = None if anew or resumed or self._guarded is None else self._guarded.guard
         self._guarded = GuardedVecEnv(with_episode_limit(self.env), self.on_bad_step, self._her_buffer().steps())
         self._guarded.guard.begin(self._last_obs)  # type: ignore[arg-type]

@@ -16,8 +16,8 @@ from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 
 
-def make(n_envs: int = 1, **kwargs: Any) -> FlatSAC:
-    env = GoalVecEnv([lambda: Monitor(Corridor(30)) for _ in range(n_envs)])
+def make(n_envs: int = 1, env: Any = None, **kwargs: Any) -> FlatSAC:
+    env = env or GoalVecEnv([lambda: Monitor(Corridor(30)) for _ in range(n_envs)])
     given = {
         "batch_size": 16,
         "gradient_ratio": 0.15,
@@ -156,6 +156,29 @@ def test_replay_loads_into_a_larger_buffer(n_envs: int, steps: int, size: int, t
     assert_episodes_are_whole(buffer)
     loaded.learn(200, reset_num_timesteps=False)
     assert_episodes_are_whole(buffer)
+
+
+@pytest.mark.parametrize("how", ["learn again", "other environments", "loaded, learn anew", "loaded, not to be closed"])
+def test_no_episode_runs_across_a_reset(how: str, tmp_path: Any) -> None:
+    def env(episode: int = 0) -> Any:
+        corridor = Corridor(50, goal=2.0)
+        corridor.episode = episode
+        return corridor
+
+    kind = DummyVecEnv if how.endswith("closed") else GoalVecEnv
+    model = make(env=kind([env]), gradient_ratio=0.0).learn(30)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "replay.npz")
+    if how.startswith("loaded"):
+        model = FlatSAC.load(tmp_path / "model.zip", env=kind([lambda: env(9)]))
+        model.load_replay_buffer(tmp_path / "replay.npz", truncate_last_traj=how.endswith("anew"))
+    elif how == "other environments":
+        model.set_env(env(9))
+    model.learn(70, reset_num_timesteps=how in ("learn again", "loaded, learn anew"))
+    buffer: Any = model.replay_buffer
+    assert_episodes_are_whole(buffer)
+    assert [int(buffer.ep_length[row, 0]) for row in (0, 30, 80)] == [30, 50, 0]
+    assert buffer.timeouts[29, 0]
 
 
 class StopAt(BaseCallback):
