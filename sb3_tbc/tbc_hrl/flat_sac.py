@@ -11,6 +11,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import MultiInputPolicy
 
 from sb3_tbc.aliases import Plain
@@ -107,8 +108,6 @@ class FlatSAC(PlainAlgorithm, SAC):
             check_goal_space(self.env.observation_space, self.env.action_space)
             refuse_vec_normalize(self.env)
             check_goal_test(self.env, infos=[{}] * TRIED)
-        if by_event and self.env is not None:
-            check_goal_strategy(config.goal_strategy, attribute_of(self.env, "subgoals"))
         if sb3._init_setup_model:
             self._setup_model()
 
@@ -118,6 +117,8 @@ class FlatSAC(PlainAlgorithm, SAC):
         """Build the networks; without an environment there is no hindsight replay, and the agent can only act."""
         if self.env is None:
             self.replay_buffer = _NO_BUFFER  # so that SB3 makes none
+        else:
+            self._check_event(self.env)
         super()._setup_model()
         if self.replay_buffer is _NO_BUFFER:
             self.replay_buffer = None
@@ -127,7 +128,27 @@ class FlatSAC(PlainAlgorithm, SAC):
 
         :raises ValueError: if the environment does not fit the agent
         """
-        super().set_env(in_fitting_vector(env, self), force_reset)
+        venv = in_fitting_vector(env, self)
+        self._check_event(venv)
+        super().set_env(venv, force_reset)
+        self._ensure_buffer()
+        self._her_buffer().env = self.env  # whose goal test labels hindsight
+
+    def _check_event(self, env: VecEnv) -> None:
+        """Refuse a task without the event that hindsight goals are to come from.
+
+        :raises ValueError: if it names none
+        """
+        if self.settings.get("goal_strategy") == "event":
+            check_goal_strategy("event", attribute_of(env, "subgoals"))
+
+    def _ensure_buffer(self) -> None:
+        """Make an empty replay buffer if there is none, as in an agent that was loaded without an environment."""
+        if self.env is not None and not isinstance(getattr(self, "replay_buffer", None), TerminatingHerReplayBuffer):
+            self.replay_buffer = TerminatingHerReplayBuffer(
+                self.buffer_size, self.observation_space, self.action_space, env=self.env, device=self.device,
+                n_envs=self.n_envs, **self.replay_buffer_kwargs,
+            )  # fmt: skip
 
     def learn(
         self: SelfFlatSAC,
@@ -269,11 +290,7 @@ class FlatSAC(PlainAlgorithm, SAC):
             continued
         :raises ValueError: if the file was written for other spaces or a larger buffer
         """
-        if not isinstance(getattr(self, "replay_buffer", None), TerminatingHerReplayBuffer) and self.env is not None:
-            self.replay_buffer = TerminatingHerReplayBuffer(
-                self.buffer_size, self.observation_space, self.action_space, env=self.env, device=self.device,
-                n_envs=self.n_envs, **self.replay_buffer_kwargs,
-            )  # fmt: skip
+        self._ensure_buffer()
         buffer = self._her_buffer()
         arrays = read_arrays(path)
         try:
@@ -301,5 +318,5 @@ class FlatSAC(PlainAlgorithm, SAC):
 
     def _her_buffer(self) -> TerminatingHerReplayBuffer:
         if not isinstance(self.replay_buffer, TerminatingHerReplayBuffer):
-            raise ValueError("there is no replay buffer: pass env when loading the agent")
+            raise ValueError("there is no replay buffer: pass env when loading the agent, or call set_env first")
         return self.replay_buffer

@@ -181,6 +181,34 @@ def test_no_episode_runs_across_a_reset(how: str, tmp_path: Any) -> None:
     assert buffer.timeouts[29, 0]
 
 
+def test_other_environments_have_their_own_goal_test(tmp_path: Any) -> None:
+    class Wide(Corridor):
+        """Every goal is met everywhere."""
+
+        def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+            return np.full(np.shape(achieved_goal)[:-1], 7.0)
+
+    model = make(gradient_ratio=0.0, n_hindsight_goals=3).learn(120)
+    model.save(tmp_path / "model.zip")
+    model.set_env(Wide(30))
+    loaded = FlatSAC.load(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match="call set_env first"):
+        loaded.learn(10)
+    loaded.set_env(Wide(30))
+    loaded.learn(120, reset_num_timesteps=False)
+    for agent in (model, loaded):
+        buffer: Any = agent.replay_buffer
+        assert buffer.env is agent.env
+        assert (buffer.sample(16).rewards[4:] == 7.0).all()  # three of four are relabelled
+
+
+def test_environments_without_the_event_of_the_goals_are_refused() -> None:
+    model = make()
+    model.settings["goal_strategy"] = "event"
+    with pytest.raises(ValueError, match="names none"):
+        model.set_env(Corridor(30))
+
+
 class StopAt(BaseCallback):
     def _on_step(self) -> bool:
         self.model.stop_requested |= self.num_timesteps >= 130
