@@ -21,7 +21,7 @@ from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import named_reset
 from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
 from sb3_tbc.tbc_hrl.calls import device_here
-from sb3_tbc.tbc_hrl.former_settings import LEVEL_NAMES, check_sb3_names
+from sb3_tbc.tbc_hrl.former_settings import check_sb3_names, without_neutral
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
 
 SelfPlain = TypeVar("SelfPlain", bound="PlainAlgorithm")
@@ -35,6 +35,8 @@ class PlainAlgorithm(BaseAlgorithm):
 
     config_class: ClassVar[type[Settings]] = Settings
     """The agent's settings; none of its own where the algorithm takes SB3's."""
+    more_changes: ClassVar[tuple[str, ...]] = ()
+    """What loading can change, or explains, besides settings and what the file holds."""
 
     def save(
         self,
@@ -83,19 +85,23 @@ class PlainAlgorithm(BaseAlgorithm):
         return plain
 
     @classmethod
-    def _check_names(cls, given: PlainMapping, data: PlainMapping) -> None:
-        """Refuse what SB3 would take without a word and never use.
+    def _changes(cls, given: PlainMapping, data: PlainMapping) -> Plain:
+        """Attributes that loading is to change.
 
-        :param given: what loading is to change
+        :param given: the changes asked for, by name
         :param data: what the file holds
-        :raises SettingError: naming the nearest known name
+        :raises SettingError: for what SB3 would take without a word and never use, naming the nearest known name
         """
-        check_sb3_names(given)
-        known = {*data, *hints(cls.config_class), *LEVEL_NAMES, "subgoals"}
-        for name in given:
+        own = hints(cls.config_class)
+        changes = without_neutral(given) if own else dict(given)
+        if own:
+            check_sb3_names(changes)
+        known = {*data, *own, *cls.more_changes}
+        for name in changes:
             if name not in known:
                 public = (other for other in known if not other.startswith("_"))
                 raise SettingError(name, f"is nothing that loading can change; {nearest(name, public)}")
+        return changes
 
     @classmethod
     def load(
@@ -120,8 +126,8 @@ class PlainAlgorithm(BaseAlgorithm):
         name = str(path) if isinstance(path, str | pathlib.Path) else "the agent"
         content = read_bytes(path)
         data, given = read_data(content, name), dict(custom_objects or {})
-        cls._check_names(kwargs, data)
+        changes = cls._changes(kwargs, data)
         plain = {} if trust else unpickled(data, name, given, env is not None)
         return super().load(
-            io.BytesIO(content), env, device_here(device), {**plain, **given}, print_system_info, force_reset, **kwargs
+            io.BytesIO(content), env, device_here(device), {**plain, **given}, print_system_info, force_reset, **changes
         )

@@ -209,6 +209,14 @@ def test_environments_without_the_event_of_the_goals_are_refused() -> None:
         model.set_env(Corridor(30))
 
 
+@pytest.mark.parametrize("name", ["actor_learning_rate", "ent_coef_learning_rate", "subgoals", "train_freq", "high"])
+def test_loading_refuses_what_is_never_used(name: str, tmp_path: Any) -> None:
+    make().save(tmp_path / "model.zip")
+    assert FlatSAC.load(tmp_path / "model.zip", use_sde=False, action_noise=None).use_sde is False
+    with pytest.raises(ValueError, match=f"{name} is n"):
+        FlatSAC.load(tmp_path / "model.zip", **{name: 0.5})
+
+
 class StopAt(BaseCallback):
     def _on_step(self) -> bool:
         self.model.stop_requested |= self.num_timesteps >= 130
