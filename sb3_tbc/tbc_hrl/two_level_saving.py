@@ -85,6 +85,9 @@ class TwoLevelSaving(PlainAlgorithm):
         for level in (self.high, self.low):
             level.refresh()
 
+    def _drop_parts(self) -> None:
+        del self.diagnostics  # the sign that there are parts whose random streams a seed restarts
+
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write both levels' replay buffers, and all else that is needed to continue learning, to one file of arrays.
 

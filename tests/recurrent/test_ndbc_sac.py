@@ -274,15 +274,15 @@ def test_the_replay_buffer_is_saved_as_plain_arrays(tmp_path: Path) -> None:
         (lambda: make(buffer_size=5), "raise buffer_size"),
         (
             lambda: make(policy_kwargs={"share_features_extractor": True}),
-            "leave policy_kwargs share_features_extractor",
+            "leave policy_kwargs share",
         ),
         (
             lambda: make(policy_kwargs={"features_extractor_class": CombinedExtractor}),
-            "features_extractor_class=.* out",
+            "class=.* out",
         ),
         (
             lambda: make(policy_kwargs={"features_extractor_kwargs": {"a": 1}}),
-            "leave policy_kwargs features_extractor_kw",
+            "extractor_kwargs=.* out",
         ),
         (lambda: make(env=gym.make("FrozenLake-v1")), "Box|supported"),
         (lambda: make(env=_Picture()), "neither images nor discrete"),
@@ -299,6 +299,8 @@ def test_loading_changes_what_the_constructor_takes(tmp_path: Path) -> None:
     changes = {"train_freq": 3, "gradient_steps": 2, "action_noise": None, "replay_buffer_kwargs": sequences}
     model = NDBCSAC.load(tmp_path / "agent", env=Recall(), use_sde=False, n_steps=1, trust=True, **changes)
     assert model.action_noise is None
+    fixed = NDBCSAC.load(tmp_path / "agent", env=Recall(), trust=True, ent_coef=0.5).learn(12)
+    assert (fixed.log_ent_coef, fixed.ent_coef_tensor.item()) == (None, 0.5)
     assert model.replay_buffer.sequence_length == 8  # type: ignore[union-attr]
     assert model.learn(30)._n_updates == 2 * 7  # after steps 12, 15, ..., 30
     for given, said in (

@@ -217,6 +217,47 @@ def test_loading_refuses_what_is_never_used(name: str, tmp_path: Any) -> None:
         FlatSAC.load(tmp_path / "model.zip", **{name: 0.5})
 
 
+def test_settings_that_loading_changes_are_applied(tmp_path: Any) -> None:
+    def loaded(**changes: Any) -> FlatSAC:
+        model = FlatSAC.load(tmp_path / "model.zip", env=GoalVecEnv([Corridor]), **changes)
+        assert changes.items() <= model.settings.items()
+        return model
+
+    taught = make(gradient_ratio=0.1).learn(300)
+    taught.save(tmp_path / "model.zip")
+    assert loaded(n_hindsight_goals=0).replay_buffer.her_ratio == 0.0
+    episode: Any = loaded(goal_strategy="episode").replay_buffer
+    assert (episode.goal_selection_strategy.name, episode.her_ratio) == ("EPISODE", 0.75)
+    assert loaded(learning_rate="lin_1e-3").lr_schedule(0.5) == pytest.approx(5e-4)
+    assert (loaded(gamma=0.5).gamma, loaded(gradient_ratio=2.0).gradient_ratio) == (0.5, 2.0)
+    assert FlatSAC.load(tmp_path / "model.zip", target_entropy="auto").target_entropy == -1.0
+
+    averaged = loaded(average_decay=0.9)
+    for average, parameter in zip(averaged.policy.average_actor.parameters(), taught.actor.parameters(), strict=True):
+        np.testing.assert_array_equal(average.numpy(), parameter.detach().numpy())
+    averaged.learn(200, reset_num_timesteps=False)
+    assert averaged._n_updates > taught._n_updates
+    averaged.save(tmp_path / "averaged.zip")
+    FlatSAC.load(tmp_path / "averaged.zip", average_decay=0.0)
+
+    fixed = loaded(ent_coef=0.1)
+    assert (fixed.ent_coef_optimizer, fixed.log_ent_coef) == (None, None)
+    fixed.learn(200, reset_num_timesteps=False).save(tmp_path / "fixed.zip")
+    assert FlatSAC.load(tmp_path / "fixed.zip").ent_coef_tensor.item() == pytest.approx(0.1)
+    assert FlatSAC.load(tmp_path / "fixed.zip", ent_coef=0.3).ent_coef_tensor.item() == pytest.approx(0.3)
+    assert FlatSAC.load(tmp_path / "fixed.zip", ent_coef="auto_0.3").log_ent_coef.exp().item() == pytest.approx(0.3)
+
+    assert loaded(policy_kwargs={"net_arch": [8, 8], "n_critics": 2}).policy_kwargs["n_critics"] == 2
+    for changes, said in (
+        ({"policy_kwargs": {"net_arch": [16]}}, "policy_kwargs cannot be changed when an agent is loaded"),
+        ({"policy_kwargs": 3}, "policy_kwargs must be"),
+        ({"goal_strategy": "event"}, "names none"),
+        ({"tau": 2.0}, "tau must be"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            loaded(**changes)
+
+
 class StopAt(BaseCallback):
     def _on_step(self) -> bool:
         self.model.stop_requested |= self.num_timesteps >= 130
