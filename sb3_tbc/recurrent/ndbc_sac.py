@@ -14,7 +14,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BaseModel, BasePolicy, ContinuousCritic
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
@@ -30,6 +30,13 @@ State = tuple[AnyArray, ...]
 """Memory ``(n_envs, state_dim)`` and last action in [-1, 1], ``(n_envs, action_dim)``."""
 NOT_TAKEN: Plain = {"use_sde": False, "optimize_memory_usage": False, "n_steps": 1}
 """Parameters of SAC that have no meaning here, and the only value that each may have."""
+
+NO_EXTRACTOR: Plain = {
+    "share_features_extractor": False,
+    "features_extractor_class": FlattenExtractor,
+    "features_extractor_kwargs": None,
+}
+"""Parameters of SB3's policy that have no meaning beside memories, and the value that SB3 itself hands on."""
 
 
 class MemoryExtractor(BaseFeaturesExtractor):
@@ -96,7 +103,8 @@ class RecurrentSACPolicy(SACPolicy):
         :class:`~sb3_tbc.tbc_hrl.level_config.CircuitConfig`
     :param critic_cell: the critics' memory; it is needed for training alone
     :param kwargs: see SB3's ``SACPolicy``
-    :raises ConfigError: for another cell, settings that it does not have, or observations that are no vectors
+    :raises ConfigError: for another cell, settings that it does not have, features extractors of SB3, or observations
+        that are no vectors
     """
 
     actor: RecurrentActor
@@ -115,6 +123,12 @@ class RecurrentSACPolicy(SACPolicy):
         critic_cell: str = "gru",
         **kwargs: Any,
     ) -> None:
+        for name, default in NO_EXTRACTOR.items():
+            if kwargs.get(name, default) not in (default, None, {}):
+                raise ConfigError(
+                    f"actor and critics have a memory each, which extracts their features: leave policy_kwargs "
+                    f"{name}={kwargs[name]!r} out; cell, hidden_size and critic_cell shape the memories"
+                )
         self.memory_kwargs: Plain = {
             "cell": cell,
             "hidden_size": hidden_size,
@@ -236,14 +250,7 @@ class NDBCSAC(PlainAlgorithm, SAC):
         replay_buffer_class: type[ReplayBuffer] | None = SequenceReplayBuffer,
         **kwargs: Any,
     ) -> None:
-        for name, default in NOT_TAKEN.items():
-            if kwargs.get(name, default) != default:
-                raise ConfigError(f"NDBCSAC has no {name}; leave it at its default, {default}")
-        if replay_buffer_class is None or not issubclass(replay_buffer_class, SequenceReplayBuffer):
-            raise ConfigError(
-                f"NDBCSAC learns from sequences, replay_buffer_class must be a SequenceReplayBuffer, got "
-                f"{replay_buffer_class}"
-            )
+        self._refuse({**kwargs, "replay_buffer_class": replay_buffer_class})
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -252,6 +259,26 @@ class NDBCSAC(PlainAlgorithm, SAC):
             replay_buffer_class=replay_buffer_class,
             **kwargs,
         )
+
+    @staticmethod
+    def _refuse(given: PlainMapping) -> None:
+        """Refuse arguments of SAC that have no meaning here.
+
+        :raises ConfigError: naming the only value, or kind of value, that one may have
+        """
+        for name, default in NOT_TAKEN.items():
+            if given.get(name, default) != default:
+                raise ConfigError(f"NDBCSAC has no {name}; leave it at its default, {default}")
+        buffer = given.get("replay_buffer_class", SequenceReplayBuffer)
+        if buffer is None or not issubclass(buffer, SequenceReplayBuffer):
+            raise ConfigError(
+                f"NDBCSAC learns from sequences, replay_buffer_class must be a SequenceReplayBuffer, got {buffer}"
+            )
+
+    @classmethod
+    def _changes(cls, given: PlainMapping, data: PlainMapping) -> Plain:
+        cls._refuse(given)
+        return super()._changes({name: value for name, value in given.items() if name not in NOT_TAKEN}, data)
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self._vec_normalize_env is not None and isinstance(self.observation_space, spaces.Dict):

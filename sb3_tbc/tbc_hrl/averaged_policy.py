@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
+from typing import Any
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
@@ -22,6 +24,13 @@ class AveragedPolicy(MultiInputPolicy):
         self.average_actor = copy.deepcopy(self.actor)
         self.average_actor.requires_grad_(False)
         self.average_actor.set_training_mode(False)
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> object:
+        """Load weights in place, see torch; where they hold no average, it begins at the actor."""
+        if not any(key.startswith("average_actor.") for key in state_dict):
+            average = {f"average_{key}": value for key, value in state_dict.items() if key.startswith("actor.")}
+            state_dict = {**state_dict, **average}
+        return super().load_state_dict(state_dict, *args, **kwargs)
 
     @th.no_grad()
     def follow(self, update: int, decay: float) -> None:

@@ -98,6 +98,29 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
             held |= {f"{part}.{key}": array for key, array in getattr(self, part).items()}
         return held
 
+    def take_over(self, saved: Arrays) -> None:
+        """Hold what another buffer held, and nothing else.
+
+        :param saved: rows of its :meth:`parts` that were written, and its ``pos``, ``full`` and ``_start``, the rows
+            ``(n_envs,)`` in which the running episodes began
+        :raises ValueError: if it was of other spaces or environments, or larger
+        """
+        rows = len(saved["actions"])
+        for name, held in self.parts().items():
+            if len(saved[name]) != rows or rows > len(held) or held.shape[1:] != saved[name].shape[1:]:
+                raise ValueError(f"saved replay buffer does not fit: {name} has shape {saved[name].shape}")
+        pos, start = int(saved["pos"]), np.asarray(saved["_start"])
+        running = np.where(start > pos, pos - start + rows, pos - start)
+        # Rows are counted modulo the size: in a larger buffer, what was a full ring begins at its oldest row.
+        shift = pos if saved["full"] and rows < self.buffer_size else 0
+        for name, held in self.parts().items():
+            held[:rows] = np.roll(saved[name], -shift, axis=0)
+        self.ep_start[:rows] = (self.ep_start[:rows] - shift) % max(rows, 1)
+        self.ep_length[rows:] = 0
+        self.full = rows == self.buffer_size
+        self.pos = (pos if self.full else rows) % self.buffer_size
+        self._current_ep_start[:] = (self.pos - running) % self.buffer_size
+
     def steps(self) -> AnyArray:
         """Steps of the running episodes so far, ``(n_envs,)``."""
         return np.asarray((self.pos - self._current_ep_start) % self.buffer_size)

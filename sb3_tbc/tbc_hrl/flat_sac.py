@@ -5,20 +5,23 @@ from __future__ import annotations
 import io
 import pathlib
 import warnings
+from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
+import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import MultiInputPolicy
 
-from sb3_tbc.aliases import Plain
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import Arrays
 from sb3_tbc.files import write_arrays
 from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.both_levels import MORE
-from sb3_tbc.settings import hints, read_partial
+from sb3_tbc.settings import SettingError, hints
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_spaces import check_goal_space
 from sb3_tbc.smdp.goal_test import TRIED, check_goal_test
@@ -34,13 +37,29 @@ from sb3_tbc.tbc_hrl.environment import attribute_of, in_fitting_vector, in_vect
 from sb3_tbc.tbc_hrl.flat_replay import TerminatingHerReplayBuffer
 from sb3_tbc.tbc_hrl.former_settings import check_sb3_names, without_neutral
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
-from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
+from sb3_tbc.tbc_hrl.saving import UNFIT, PlainAlgorithm
 
 SelfFlatSAC = TypeVar("SelfFlatSAC", bound="FlatSAC")
 
 CYCLE = 100
 """Environment steps between two bursts of updates."""
 _NO_BUFFER: Any = object()
+
+
+def sb3_arguments(config: FlatConfig) -> Plain:
+    """Settings under the names, and in the forms, that Stable-Baselines3's SAC takes."""
+    by_event = config.goal_strategy == "event"
+    same = ("batch_size", "gamma", "tau", "ent_coef", "target_entropy", "buffer_size", "learning_starts")
+    return {
+        **{name: getattr(config, name) for name in same},
+        "learning_rate": learning_rate_of(config.learning_rate),
+        "replay_buffer_kwargs": {
+            "n_sampled_goal": config.n_hindsight_goals,
+            "goal_selection_strategy": "future" if by_event else config.goal_strategy,
+            "event_goals": by_event,
+        },
+        "policy_kwargs": config.policy_kwargs.to_dict(),
+    }
 
 
 class FlatSAC(PlainAlgorithm, SAC):
@@ -73,29 +92,13 @@ class FlatSAC(PlainAlgorithm, SAC):
         self._counted_to: int | None = None
         self._resumed: Plain = {}
         self.stop_requested = False
-        by_event = config.goal_strategy == "event"
-        if config.average_decay and policy in ("MultiInputPolicy", MultiInputPolicy):
-            policy = AveragedPolicy
         super().__init__(
             policy,  # type: ignore[arg-type]
             env,
-            learning_rate=learning_rate_of(config.learning_rate),
-            batch_size=config.batch_size,
-            gamma=config.gamma,
-            tau=config.tau,
-            ent_coef=config.ent_coef,
-            target_entropy=config.target_entropy,
-            buffer_size=config.buffer_size,
-            learning_starts=config.learning_starts,
+            **sb3_arguments(config),
             train_freq=(CYCLE, "step"),
             gradient_steps=1,  # see _update
             replay_buffer_class=TerminatingHerReplayBuffer,
-            replay_buffer_kwargs={
-                "n_sampled_goal": config.n_hindsight_goals,
-                "goal_selection_strategy": "future" if by_event else config.goal_strategy,
-                "event_goals": by_event,
-            },
-            policy_kwargs=config.policy_kwargs.to_dict(),
             stats_window_size=sb3.stats_window_size,
             tensorboard_log=None if sb3.tensorboard_log is None else str(sb3.tensorboard_log),
             verbose=sb3.verbose,
@@ -107,8 +110,6 @@ class FlatSAC(PlainAlgorithm, SAC):
             check_goal_space(self.env.observation_space, self.env.action_space)
             refuse_vec_normalize(self.env)
             check_goal_test(self.env, infos=[{}] * TRIED)
-        if by_event and self.env is not None:
-            check_goal_strategy(config.goal_strategy, attribute_of(self.env, "subgoals"))
         if sb3._init_setup_model:
             self._setup_model()
 
@@ -116,8 +117,14 @@ class FlatSAC(PlainAlgorithm, SAC):
 
     def _setup_model(self) -> None:
         """Build the networks; without an environment there is no hindsight replay, and the agent can only act."""
+        if self.settings.get("average_decay") and self.policy_class is MultiInputPolicy:
+            self.policy_class = AveragedPolicy
+        if self.target_entropy == "auto":
+            self.target_entropy = -float(np.prod(self.action_space.shape or ()))  # SB3 asks the environment
         if self.env is None:
             self.replay_buffer = _NO_BUFFER  # so that SB3 makes none
+        else:
+            self._check_event(self.env)
         super()._setup_model()
         if self.replay_buffer is _NO_BUFFER:
             self.replay_buffer = None
@@ -127,7 +134,27 @@ class FlatSAC(PlainAlgorithm, SAC):
 
         :raises ValueError: if the environment does not fit the agent
         """
-        super().set_env(in_fitting_vector(env, self), force_reset)
+        venv = in_fitting_vector(env, self)
+        self._check_event(venv)
+        super().set_env(venv, force_reset)
+        self._ensure_buffer()
+        self._her_buffer().env = self.env  # whose goal test labels hindsight
+
+    def _check_event(self, env: VecEnv) -> None:
+        """Refuse a task without the event that hindsight goals are to come from.
+
+        :raises ValueError: if it names none
+        """
+        if self.settings.get("goal_strategy") == "event":
+            check_goal_strategy("event", attribute_of(env, "subgoals"))
+
+    def _ensure_buffer(self) -> None:
+        """Make an empty replay buffer if there is none, as in an agent that was loaded without an environment."""
+        if self.env is not None and not isinstance(getattr(self, "replay_buffer", None), TerminatingHerReplayBuffer):
+            self.replay_buffer = TerminatingHerReplayBuffer(
+                self.buffer_size, self.observation_space, self.action_space, env=self.env, device=self.device,
+                n_envs=self.n_envs, **self.replay_buffer_kwargs,
+            )  # fmt: skip
 
     def learn(
         self: SelfFlatSAC,
@@ -160,8 +187,9 @@ class FlatSAC(PlainAlgorithm, SAC):
             self._updated_at += self.num_timesteps - self._counted_to  # steps that were not done here owe no updates
         self._counted_to = self.num_timesteps
         record_settings(self, self.settings)
-        if resumed and not resume.set_flat_state(self, self.env, resumed):
-            self.close_running_episodes()
+        relived = bool(resumed) and resume.set_flat_state(self, self.env, resumed)
+        if (anew or resumed) and not relived:
+            self.close_running_episodes()  # hindsight goals are of the same episode
         before = None if anew or resumed or self._guarded is None else self._guarded.guard
         self._guarded = GuardedVecEnv(with_episode_limit(self.env), self.on_bad_step, self._her_buffer().steps())
         self._guarded.guard.begin(self._last_obs)  # type: ignore[arg-type]
@@ -232,16 +260,23 @@ class FlatSAC(PlainAlgorithm, SAC):
         return resume.get_flat_state(self)
 
     @classmethod
-    def load(cls: type[SelfFlatSAC], *args: Any, **kwargs: Any) -> SelfFlatSAC:
-        """Load an agent, see SB3; settings given here replace those that it was saved with.
-
-        :raises SettingError: on an unknown setting or a value that it cannot have
-        """
-        given = {name: value for name, value in kwargs.items() if name in hints(cls.config_class)}
-        checked = read_partial(given, hints(cls.config_class))
-        model = super().load(*args, **kwargs)
-        model.settings = {**model.settings, **checked}
-        return model
+    def _changes(cls, given: PlainMapping, data: PlainMapping) -> Plain:
+        changes, own = super()._changes(given, data), hints(cls.config_class)
+        changed = {name: changes.pop(name) for name in own if name in changes}
+        if not changed:
+            return changes
+        saved = {name: value for name, value in data.get("settings", {}).items() if name in own}
+        if isinstance(changed.get("policy_kwargs"), Mapping):
+            changed["policy_kwargs"] = {**saved.get("policy_kwargs", {}), **changed["policy_kwargs"]}
+        config = cls.config_class.from_dict({**saved, **changed})
+        if config.policy_kwargs != cls.config_class.from_dict(saved).policy_kwargs:
+            raise SettingError("policy_kwargs", UNFIT)
+        new = {*changed} - {"policy_kwargs"}
+        if new & {"n_hindsight_goals", "goal_strategy"}:
+            new.add("replay_buffer_kwargs")
+        attributes = {**sb3_arguments(config), "gradient_ratio": config.gradient_ratio}
+        changes |= {name: value for name, value in attributes.items() if name in new}
+        return {**changes, "settings": config.to_dict()}
 
     def save_replay_buffer(
         self, path: str | pathlib.Path | io.BufferedIOBase, learning_state: Arrays | None = None
@@ -268,31 +303,17 @@ class FlatSAC(PlainAlgorithm, SAC):
             continued
         :raises ValueError: if the file was written for other spaces or a larger buffer
         """
-        if not isinstance(getattr(self, "replay_buffer", None), TerminatingHerReplayBuffer) and self.env is not None:
-            self.replay_buffer = TerminatingHerReplayBuffer(
-                self.buffer_size, self.observation_space, self.action_space, env=self.env, device=self.device,
-                n_envs=self.n_envs, **self.replay_buffer_kwargs,
-            )  # fmt: skip
+        self._ensure_buffer()
         buffer = self._her_buffer()
         arrays = read_arrays(path)
         try:
-            self._take_over(buffer, arrays)
+            buffer.take_over(arrays)
         except (KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path} is no saved replay buffer of such an agent: {error!r}") from error
-        if truncate_last_traj and not resume.can_go_on(self, self._resumed):
-            self.close_running_episodes()
-
-    def _take_over(self, buffer: TerminatingHerReplayBuffer, arrays: Arrays) -> None:
-        rows = len(arrays["actions"])
-        for name, held in buffer.parts().items():
-            if len(arrays[name]) != rows or rows > len(held) or held.shape[1:] != arrays[name].shape[1:]:
-                raise ValueError(f"saved replay buffer does not fit: {name} has shape {arrays[name].shape}")
-        for name, held in buffer.parts().items():
-            held[:rows] = arrays[name]
-        buffer._current_ep_start[:] = arrays["_start"]
-        buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
         more = [name for name in arrays if name.startswith(f"{MORE}.")]
         self._resumed = {name.removeprefix(f"{MORE}."): arrays[name] for name in more}
+        if truncate_last_traj and not resume.can_go_on(self, self._resumed):
+            self.close_running_episodes()
 
     def close_running_episodes(self) -> None:
         """End the running episodes where they are: what was stored of them is used, and they are not continued."""
@@ -310,5 +331,5 @@ class FlatSAC(PlainAlgorithm, SAC):
 
     def _her_buffer(self) -> TerminatingHerReplayBuffer:
         if not isinstance(self.replay_buffer, TerminatingHerReplayBuffer):
-            raise ValueError("there is no replay buffer: pass env when loading the agent")
+            raise ValueError("there is no replay buffer: pass env when loading the agent, or call set_env first")
         return self.replay_buffer

@@ -164,13 +164,14 @@ def can_go_on(model: OffPolicyAlgorithm, state: Mapping[str, AnyArray]) -> bool:
 
 
 def set_flat_state(model: OffPolicyAlgorithm, env: VecEnv, state: Mapping[str, AnyArray]) -> bool:
-    """Restore what :func:`get_flat_state` gave; False if replaying the saved episodes led to other observations.
+    """Restore what :func:`get_flat_state` gave; False if the saved episodes cannot be continued.
 
-    The environments then begin new episodes, and the log says so; likewise if the episodes were not recorded.
+    They were not recorded, or replaying them led to other observations. The environments then begin new episodes, and
+    the log says so.
     """
     if not can_go_on(model, state) or not isinstance(env, GoalVecEnv):
         logger.warning(NOT_KNOWN)
-        return True
+        return False
     plain = json.loads(str(state["plain"]))
     seen = env.relive(_episodes(plain["episodes"], state))
     if not all(np.array_equal(seen[key], state[f"last.{key}"]) for key in seen):

@@ -5,26 +5,40 @@ from __future__ import annotations
 import contextlib
 import io
 import pathlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, TypeVar
 
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import nearest
 from sb3_tbc.files import save_atomic
-from sb3_tbc.settings import SettingError, Settings, hints
+from sb3_tbc.settings import SettingError, Settings, hints, plain
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import named_reset
 from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
 from sb3_tbc.tbc_hrl.calls import device_here
-from sb3_tbc.tbc_hrl.former_settings import LEVEL_NAMES, check_sb3_names
+from sb3_tbc.tbc_hrl.former_settings import check_sb3_names, without_neutral
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
 
 SelfPlain = TypeVar("SelfPlain", bound="PlainAlgorithm")
+
+ENT_COEF = "ent_coef"
+PARTS = (ENT_COEF, "duration", "fixed_duration", "duration_loss_coef")
+"""Settings that decide which parts an agent has, such as an optimizer. They are changed after it was loaded."""
+LEVELS = ("high", "low")
+TEMPERATURE = ("ent_coef_optimizer", "log_ent_coef", "ent_coef_tensor")
+"""Where SB3's SAC keeps what an ``ent_coef`` has become."""
+SHAPES = frozenset({"duration", "window_end", "remaining_time", "critic_norm", "policy_kwargs", "subgoals"})
+"""Settings, or sections of them, that shape the networks."""
+UNFIT = (
+    "cannot be changed when an agent is loaded: the saved weights do not fit the networks it would have; leave it out, "
+    "or train a new agent"
+)
 
 
 class PlainAlgorithm(BaseAlgorithm):
@@ -35,6 +49,8 @@ class PlainAlgorithm(BaseAlgorithm):
 
     config_class: ClassVar[type[Settings]] = Settings
     """The agent's settings; none of its own where the algorithm takes SB3's."""
+    more_changes: ClassVar[tuple[str, ...]] = ()
+    """What loading can change, or explains, besides settings and what the file holds."""
 
     def save(
         self,
@@ -83,19 +99,24 @@ class PlainAlgorithm(BaseAlgorithm):
         return plain
 
     @classmethod
-    def _check_names(cls, given: PlainMapping, data: PlainMapping) -> None:
-        """Refuse what SB3 would take without a word and never use.
+    def _changes(cls, given: PlainMapping, data: PlainMapping) -> Plain:
+        """Attributes that loading is to change.
 
-        :param given: what loading is to change
+        :param given: the changes asked for, by name
         :param data: what the file holds
-        :raises SettingError: naming the nearest known name
+        :raises SettingError: for what SB3 would take without a word and never use, naming the nearest known name
         """
-        check_sb3_names(given)
-        known = {*data, *hints(cls.config_class), *LEVEL_NAMES, "subgoals"}
-        for name in given:
+        own = hints(cls.config_class)
+        changes = {name: plain(value) if name in own else value for name, value in given.items()}
+        changes = without_neutral(changes) if own else changes
+        if own:
+            check_sb3_names(changes)
+        known = {*data, *own, *cls.more_changes}
+        for name in changes:
             if name not in known:
                 public = (other for other in known if not other.startswith("_"))
                 raise SettingError(name, f"is nothing that loading can change; {nearest(name, public)}")
+        return changes
 
     @classmethod
     def load(
@@ -111,17 +132,90 @@ class PlainAlgorithm(BaseAlgorithm):
     ) -> SelfPlain:
         """Load an agent, see SB3, without running any code from the file.
 
+        Settings given here replace those that it was saved with. A temperature with another ``ent_coef`` begins anew.
+
         :param trust: also unpickle what has no plain form, as SB3 always does: agents of versions up to 0.1, policy
             classes and subgoal functions of your own. Use it only for files whose origin you trust: unpickling can run
             any code.
         :raises UntrustedError: if the file holds something that must be unpickled, unless ``trust`` is given
         :raises ConfigError: if the file is damaged or no agent
+        :raises SettingError: on an unknown setting, a value that it cannot have, or one that the weights do not fit
         """
+        device = device_here(device)
         name = str(path) if isinstance(path, str | pathlib.Path) else "the agent"
         content = read_bytes(path)
         data, given = read_data(content, name), dict(custom_objects or {})
-        cls._check_names(kwargs, data)
-        plain = {} if trust else unpickled(data, name, given, env is not None)
-        return super().load(
-            io.BytesIO(content), env, device_here(device), {**plain, **given}, print_system_info, force_reset, **kwargs
-        )
+        changes = cls._changes(kwargs, data)
+        now, later = parted(changes)
+        values = {} if trust else unpickled(data, name, given, env is not None)
+        try:
+            model = super().load(
+                io.BytesIO(content), env, device, {**values, **given}, print_system_info, force_reset, **now
+            )
+            model._change_parts(later)
+        except RuntimeError as error:
+            if not changes or "state_dict" not in str(error):  # torch's word for weights that do not fit
+                raise
+            raise SettingError(named(changes), UNFIT) from error
+        return model
+
+    def _change_parts(self, given: PlainMapping) -> None:
+        """Change settings in :data:`PARTS`: what they bring in begins anew, the rest keeps its parameters.
+
+        :param given: settings by dotted name
+        """
+        changed = {name: value for name, value in given.items() if recursive_getattr(self, name) != value}
+        if not changed:
+            return
+        saved = self.get_parameters()
+        tensors = {name: recursive_getattr(self, name) for name in self._get_torch_save_params()[1]}
+        levels = [name.removesuffix(ENT_COEF) for name in changed if name.endswith(ENT_COEF)]
+        anew = {level + part for level in levels for part in TEMPERATURE}
+        self._drop_parts()
+        for name, value in changed.items():
+            section, _, key = name.rpartition(".")
+            vars(self).update({section: {key: value}} if section else {key: value})
+        self._setup_model()
+        fresh = self.get_parameters()
+        kept = {name: state for name, state in saved.items() if name in fresh and name not in anew}
+        self.set_parameters({**fresh, **kept})  # type: ignore[dict-item]
+        for name in self._get_torch_save_params()[1]:
+            if name not in anew:
+                recursive_setattr(self, f"{name}.data", tensors[name].data)
+
+    def _drop_parts(self) -> None:
+        """Forget what :meth:`_setup_model` would otherwise keep, or touch, of the parts that there are."""
+        vars(self).update(dict.fromkeys(TEMPERATURE))
+
+
+def parted(given: PlainMapping, where: str = "") -> tuple[Plain, Plain]:
+    """Changes without those in :data:`PARTS`, and the latter by dotted name.
+
+    :param given: values by name
+    :param where: the level they belong to, with a dot
+    """
+    now: Plain = {}
+    later: Plain = {}
+    for name, value in given.items():
+        if name in PARTS:
+            later[where + name] = value
+        elif name in LEVELS and isinstance(value, Mapping):
+            now[name], inside = parted(value, f"{where}{name}.")
+            later |= inside
+        else:
+            now[name] = value
+    return now, later
+
+
+def named(changes: PlainMapping) -> str:
+    """What was to be changed, for a message: settings that shape networks, else all."""
+    names = list(_leaves(changes))
+    return ", ".join([name for name in names if set(name.split(".")) & SHAPES] or names)
+
+
+def _leaves(given: PlainMapping, where: str = "") -> Iterator[str]:
+    for name, value in given.items():
+        if isinstance(value, Mapping) and value:
+            yield from _leaves(value, f"{where}{name}.")
+        else:
+            yield where + name

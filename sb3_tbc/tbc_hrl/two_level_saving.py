@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import pathlib
 from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
@@ -21,6 +21,7 @@ from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.environment import mismatch_explained
+from sb3_tbc.tbc_hrl.former_settings import LEVEL_NAMES
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import Reachability
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
@@ -31,6 +32,7 @@ SelfTwoLevel = TypeVar("SelfTwoLevel", bound="TwoLevelSaving")
 class TwoLevelSaving(PlainAlgorithm):
     """Saving and loading of an agent of two levels; the agent itself builds the parts named here."""
 
+    more_changes: ClassVar[tuple[str, ...]] = (*LEVEL_NAMES, "subgoals")
     policy: TBCPolicy
     high: SACLevel
     low: SACLevel
@@ -82,6 +84,9 @@ class TwoLevelSaving(PlainAlgorithm):
         super().set_parameters(load_path_or_dict, exact_match, device)
         for level in (self.high, self.low):
             level.refresh()
+
+    def _drop_parts(self) -> None:
+        del self.diagnostics  # the sign that there are parts whose random streams a seed restarts
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write both levels' replay buffers, and all else that is needed to continue learning, to one file of arrays.

@@ -17,6 +17,7 @@ from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tbc import NDBCSAC
@@ -271,6 +272,18 @@ def test_the_replay_buffer_is_saved_as_plain_arrays(tmp_path: Path) -> None:
         (lambda: make(replay_buffer_class=HerReplayBuffer), "must be a SequenceReplayBuffer"),
         (lambda: make(replay_buffer_kwargs={"sequence_length": 4, "burn_in": 4}), "burn_in < sequence_length"),
         (lambda: make(buffer_size=5), "raise buffer_size"),
+        (
+            lambda: make(policy_kwargs={"share_features_extractor": True}),
+            "leave policy_kwargs share",
+        ),
+        (
+            lambda: make(policy_kwargs={"features_extractor_class": CombinedExtractor}),
+            "class=.* out",
+        ),
+        (
+            lambda: make(policy_kwargs={"features_extractor_kwargs": {"a": 1}}),
+            "extractor_kwargs=.* out",
+        ),
         (lambda: make(env=gym.make("FrozenLake-v1")), "Box|supported"),
         (lambda: make(env=_Picture()), "neither images nor discrete"),
     ],
@@ -278,6 +291,29 @@ def test_the_replay_buffer_is_saved_as_plain_arrays(tmp_path: Path) -> None:
 def test_what_it_cannot_do_is_refused_in_one_line(build: Callable[[], Any], said: str) -> None:
     with pytest.raises((ValueError, AssertionError), match=said):
         build()
+
+
+def test_loading_changes_what_the_constructor_takes(tmp_path: Path) -> None:
+    make(action_noise=NormalActionNoise(np.zeros(1), np.ones(1))).save(tmp_path / "agent")
+    sequences = {"sequence_length": 8, "burn_in": 1}
+    changes = {"train_freq": 3, "gradient_steps": 2, "action_noise": None, "replay_buffer_kwargs": sequences}
+    model = NDBCSAC.load(tmp_path / "agent", env=Recall(), use_sde=False, n_steps=1, trust=True, **changes)
+    assert model.action_noise is None
+    fixed = NDBCSAC.load(tmp_path / "agent", env=Recall(), trust=True, ent_coef=0.5).learn(12)
+    assert (fixed.log_ent_coef, fixed.ent_coef_tensor.item()) == (None, 0.5)
+    assert model.replay_buffer.sequence_length == 8  # type: ignore[union-attr]
+    assert model.learn(30)._n_updates == 2 * 7  # after steps 12, 15, ..., 30
+    for given, said in (
+        ({"use_sde": True}, "has no use_sde"),
+        ({"replay_buffer_class": None}, "must be a SequenceReplayBuffer"),
+        ({"actor_learning_rate": 1.0}, "did you mean 'learning_rate'"),
+        ({"ent_coef_learning_rate": 1.0}, "nothing that loading can change"),
+        ({"average_decay": 0.5}, "nothing that loading can change"),
+        ({"subgoals": 1}, "nothing that loading can change"),
+        ({"gradient_ratio": 1.0}, "nothing that loading can change"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            NDBCSAC.load(tmp_path / "agent", env=Recall(), trust=True, **given)
 
 
 class _Picture(Recall):

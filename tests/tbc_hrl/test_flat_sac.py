@@ -16,8 +16,8 @@ from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 
 
-def make(n_envs: int = 1, **kwargs: Any) -> FlatSAC:
-    env = GoalVecEnv([lambda: Monitor(Corridor(30)) for _ in range(n_envs)])
+def make(n_envs: int = 1, env: Any = None, **kwargs: Any) -> FlatSAC:
+    env = env or GoalVecEnv([lambda: Monitor(Corridor(30)) for _ in range(n_envs)])
     given = {
         "batch_size": 16,
         "gradient_ratio": 0.15,
@@ -122,6 +122,140 @@ def test_other_vectors_begin_new_episodes_and_say_so(tmp_path: Any, caplog: Any)
     assert "begin new episodes" in caplog.text
     assert loaded.num_timesteps == 230
     assert loaded.replay_buffer is not None
+
+
+def assert_episodes_are_whole(buffer: Any) -> None:
+    """Every row that is sampled lies within its episode, all of whose rows are of the same one of the corridor."""
+    for row, env in zip(*np.nonzero(buffer.ep_length), strict=True):
+        start, length = buffer.ep_start[row, env], buffer.ep_length[row, env]
+        assert (row - start) % buffer.buffer_size < length
+        rows = (start + np.arange(length)) % buffer.buffer_size
+        lived = buffer.observations["observation"][rows, env, 2]
+        assert len(set(lived)) == 1, f"one episode of {length} steps is of several: {lived}"
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("steps", [40, 230])
+@pytest.mark.parametrize("size", [40, 80, 300])
+def test_replay_loads_into_a_larger_buffer(n_envs: int, steps: int, size: int, tmp_path: Any) -> None:
+    model = make(n_envs, buffer_size=80 * n_envs, gradient_ratio=0.0).learn(steps * n_envs)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "replay.npz")
+    env = GoalVecEnv([lambda: Corridor(30)] * n_envs)
+    loaded = FlatSAC.load(tmp_path / "model.zip", env=env, buffer_size=size * n_envs, gradient_ratio=0.02)
+    if size < min(steps, 80):
+        with pytest.raises(ValueError, match="does not fit"):
+            loaded.load_replay_buffer(tmp_path / "replay.npz")
+        return
+    buffer: Any = loaded.replay_buffer
+    buffer.ep_length[:] = 7  # of what was in it before
+    loaded.load_replay_buffer(tmp_path / "replay.npz", truncate_last_traj=False)
+    assert buffer.size() == model.replay_buffer.size()
+    assert (buffer.steps() == model.replay_buffer.steps()).all()
+    assert (buffer.ep_length > 0).sum() == (model.replay_buffer.ep_length > 0).sum() > 0
+    assert_episodes_are_whole(buffer)
+    loaded.learn(200, reset_num_timesteps=False)
+    assert_episodes_are_whole(buffer)
+
+
+@pytest.mark.parametrize("how", ["learn again", "other environments", "loaded, learn anew", "loaded, not to be closed"])
+def test_no_episode_runs_across_a_reset(how: str, tmp_path: Any) -> None:
+    def env(episode: int = 0) -> Any:
+        corridor = Corridor(50, goal=2.0)
+        corridor.episode = episode
+        return corridor
+
+    kind = DummyVecEnv if how.endswith("closed") else GoalVecEnv
+    model = make(env=kind([env]), gradient_ratio=0.0).learn(30)
+    model.save(tmp_path / "model.zip")
+    model.save_replay_buffer(tmp_path / "replay.npz")
+    if how.startswith("loaded"):
+        model = FlatSAC.load(tmp_path / "model.zip", env=kind([lambda: env(9)]))
+        model.load_replay_buffer(tmp_path / "replay.npz", truncate_last_traj=how.endswith("anew"))
+    elif how == "other environments":
+        model.set_env(env(9))
+    model.learn(70, reset_num_timesteps=how in ("learn again", "loaded, learn anew"))
+    buffer: Any = model.replay_buffer
+    assert_episodes_are_whole(buffer)
+    assert [int(buffer.ep_length[row, 0]) for row in (0, 30, 80)] == [30, 50, 0]
+    assert buffer.timeouts[29, 0]
+
+
+def test_other_environments_have_their_own_goal_test(tmp_path: Any) -> None:
+    class Wide(Corridor):
+        """Every goal is met everywhere."""
+
+        def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+            return np.full(np.shape(achieved_goal)[:-1], 7.0)
+
+    model = make(gradient_ratio=0.0, n_hindsight_goals=3).learn(120)
+    model.save(tmp_path / "model.zip")
+    model.set_env(Wide(30))
+    loaded = FlatSAC.load(tmp_path / "model.zip")
+    with pytest.raises(ValueError, match="call set_env first"):
+        loaded.learn(10)
+    loaded.set_env(Wide(30))
+    loaded.learn(120, reset_num_timesteps=False)
+    for agent in (model, loaded):
+        buffer: Any = agent.replay_buffer
+        assert buffer.env is agent.env
+        assert (buffer.sample(16).rewards[4:] == 7.0).all()  # three of four are relabelled
+
+
+def test_environments_without_the_event_of_the_goals_are_refused() -> None:
+    model = make()
+    model.settings["goal_strategy"] = "event"
+    with pytest.raises(ValueError, match="names none"):
+        model.set_env(Corridor(30))
+
+
+@pytest.mark.parametrize("name", ["actor_learning_rate", "ent_coef_learning_rate", "subgoals", "train_freq", "high"])
+def test_loading_refuses_what_is_never_used(name: str, tmp_path: Any) -> None:
+    make().save(tmp_path / "model.zip")
+    assert FlatSAC.load(tmp_path / "model.zip", use_sde=False, action_noise=None).use_sde is False
+    with pytest.raises(ValueError, match=f"{name} is n"):
+        FlatSAC.load(tmp_path / "model.zip", **{name: 0.5})
+
+
+def test_settings_that_loading_changes_are_applied(tmp_path: Any) -> None:
+    def loaded(**changes: Any) -> FlatSAC:
+        model = FlatSAC.load(tmp_path / "model.zip", env=GoalVecEnv([Corridor]), **changes)
+        assert changes.items() <= model.settings.items()
+        return model
+
+    taught = make(gradient_ratio=0.1).learn(300)
+    taught.save(tmp_path / "model.zip")
+    assert loaded(n_hindsight_goals=0).replay_buffer.her_ratio == 0.0
+    episode: Any = loaded(goal_strategy="episode").replay_buffer
+    assert (episode.goal_selection_strategy.name, episode.her_ratio) == ("EPISODE", 0.75)
+    assert loaded(learning_rate="lin_1e-3").lr_schedule(0.5) == pytest.approx(5e-4)
+    assert (loaded(gamma=0.5).gamma, loaded(gradient_ratio=2.0).gradient_ratio) == (0.5, 2.0)
+    assert FlatSAC.load(tmp_path / "model.zip", target_entropy="auto").target_entropy == -1.0
+
+    averaged = loaded(average_decay=0.9)
+    for average, parameter in zip(averaged.policy.average_actor.parameters(), taught.actor.parameters(), strict=True):
+        np.testing.assert_array_equal(average.numpy(), parameter.detach().numpy())
+    averaged.learn(200, reset_num_timesteps=False)
+    assert averaged._n_updates > taught._n_updates
+    averaged.save(tmp_path / "averaged.zip")
+    FlatSAC.load(tmp_path / "averaged.zip", average_decay=0.0)
+
+    fixed = loaded(ent_coef=0.1)
+    assert (fixed.ent_coef_optimizer, fixed.log_ent_coef) == (None, None)
+    fixed.learn(200, reset_num_timesteps=False).save(tmp_path / "fixed.zip")
+    assert FlatSAC.load(tmp_path / "fixed.zip").ent_coef_tensor.item() == pytest.approx(0.1)
+    assert FlatSAC.load(tmp_path / "fixed.zip", ent_coef=0.3).ent_coef_tensor.item() == pytest.approx(0.3)
+    assert FlatSAC.load(tmp_path / "fixed.zip", ent_coef="auto_0.3").log_ent_coef.exp().item() == pytest.approx(0.3)
+
+    assert loaded(policy_kwargs={"net_arch": [8, 8], "n_critics": 2}).policy_kwargs["n_critics"] == 2
+    for changes, said in (
+        ({"policy_kwargs": {"net_arch": [16]}}, "policy_kwargs cannot be changed when an agent is loaded"),
+        ({"policy_kwargs": 3}, "policy_kwargs must be"),
+        ({"goal_strategy": "event"}, "names none"),
+        ({"tau": 2.0}, "tau must be"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            loaded(**changes)
 
 
 class StopAt(BaseCallback):

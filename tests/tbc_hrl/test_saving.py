@@ -1,0 +1,105 @@
+"""Settings that loading changes: what follows from them begins anew, what the weights do not fit is refused."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from corridor import Corridor
+
+from sb3_tbc import TBCHRL
+from sb3_tbc.settings import SettingError
+from sb3_tbc.tbc_hrl.config import LowConfig
+
+LEVEL: dict[str, Any] = {"batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}}
+
+
+def agent(**settings: Any) -> TBCHRL:
+    given = {"high": LEVEL, "low": LEVEL, "max_options": 5, "gradient_ratio": 0.2, "compile": False, "seed": 0}
+    return TBCHRL("MultiInputPolicy", Corridor(20), **{**given, **settings})
+
+
+def saved(model: TBCHRL) -> io.BytesIO:
+    file = io.BytesIO()
+    model.save(file)  # type: ignore[arg-type]
+    return file
+
+
+@pytest.fixture(scope="module")
+def taught() -> TBCHRL:
+    return agent().learn(60)
+
+
+def temperature(level: Any) -> float:
+    return float(level.ent_coef_tensor if level.log_ent_coef is None else level.log_ent_coef.detach().exp())
+
+
+@pytest.mark.parametrize(
+    ("level", "ent_coef", "begins"),
+    [
+        ("low", 0.1, 0.1),
+        ("low", "auto_0.25", 0.25),
+        ("low", "auto", None),
+        ("high", "auto", 1.0),
+        ("high", 0.2, 0.2),
+        ("high", 1.0, 1.0),
+    ],
+)
+def test_another_temperature_begins_anew(taught: TBCHRL, level: str, ent_coef: Any, begins: float | None) -> None:
+    file = saved(taught)
+    model = TBCHRL.load(file, env=Corridor(20), **{level: {"ent_coef": ent_coef, "batch_size": 4}})  # type: ignore[arg-type]
+    expected = temperature(taught.low) if begins is None else begins
+    assert temperature(getattr(model, level)) == pytest.approx(expected)
+    other = "low" if level == "high" else "high"
+    assert temperature(getattr(model, other)) == temperature(getattr(taught, other))
+    assert model.settings[level]["ent_coef"] == ent_coef
+    assert model.settings[level]["batch_size"] == 4
+    for name in ("high", "low"):
+        old, new = getattr(taught, name), getattr(model, name)
+        for key, value in old.policy.state_dict().items():
+            np.testing.assert_array_equal(new.policy.state_dict()[key].numpy(), value.numpy(), err_msg=key)
+        th.testing.assert_close(new.critic.optimizer.state_dict(), old.critic.optimizer.state_dict())
+    model.learn(40, reset_num_timesteps=False)
+    again = TBCHRL.load(saved(model))  # type: ignore[arg-type]
+    assert temperature(getattr(again, level)) == temperature(getattr(model, level))
+
+
+@pytest.mark.parametrize(
+    ("duration", "changes", "estimates"),
+    [
+        ("joint", {"duration_loss_coef": 1.0}, True),
+        ("fixed", {"duration": "rule"}, True),
+        ("rule", {"duration": "fixed", "fixed_duration": 3}, False),
+    ],
+)
+def test_the_reachability_estimate_comes_and_goes(duration: str, changes: Any, estimates: bool) -> None:
+    model = TBCHRL.load(saved(agent(duration=duration)), env=Corridor(20), **changes)  # type: ignore[arg-type]
+    assert (model.reachability is not None) == estimates
+    assert changes.items() <= model.settings.items()
+    model.learn(40)
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"duration": "rule"}, "duration"),
+        ({"low": {"critic_norm": "layer", "batch_size": 4}}, "low.critic_norm"),
+        ({"high": {"critic_norm": "batch"}}, "high.critic_norm"),
+        ({"low": {"policy_kwargs": {"n_critics": 3}}, "max_options": 3}, "low.policy_kwargs.n_critics"),
+        ({"low": {"policy_kwargs": {"ndbc": None}, "ent_coef": 0.1}}, "low.policy_kwargs.ndbc"),
+    ],
+)
+def test_what_the_weights_do_not_fit_is_refused_by_name(taught: TBCHRL, changes: Any, named: str) -> None:
+    with pytest.raises(SettingError, match=f"^{named} cannot be changed when an agent is loaded: the saved weights"):
+        TBCHRL.load(saved(taught), env=Corridor(20), **changes)  # type: ignore[arg-type]
+
+
+def test_a_level_may_be_given_as_settings_and_neutral_arguments_of_sb3_pass(taught: TBCHRL) -> None:
+    low = LowConfig(batch_size=4, buffer_size=300, policy_kwargs=LEVEL["policy_kwargs"])
+    model = TBCHRL.load(saved(taught), env=Corridor(20), low=low, use_sde=False)  # type: ignore[arg-type]
+    assert (model.config.low.batch_size, model.config.low.buffer_size) == (4, 300)
+    with pytest.raises(SettingError, match="use_sde is not taken"):
+        TBCHRL.load(saved(taught), use_sde=True)  # type: ignore[arg-type]
