@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from sb3_tbc.campaign.campaign import Campaign
@@ -21,7 +22,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
 from sb3_tbc.train import N_EVAL_EPISODES, default_eval_freq, variant_name
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
-from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, ablations_of, load_config, parse_overrides
+from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, RunConfig, ablations_of, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env, task_names
 from sb3_tbc.zoo.ledger import RunFolder
 
@@ -51,7 +52,7 @@ def build_parser() -> Parser:
     add("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
     add("--ablations", action="store_true", help="every ablation that changes something in a task's settings; "
         "needs --algos tbc-hrl")  # fmt: skip
-    add("--variant", help="name of the runs' folder; by default from --config and --ablation")
+    add("--variant", help="name of the runs' folder; by default as in sb3_tbc.train")
     add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as in sb3_tbc.train")
     add("--n-timesteps", type=positive_int, help="environment steps of each run; by default the task's")
     add("--eval-freq", type=positive_int, help="steps between evaluations; by default a fortieth of the run")
@@ -86,20 +87,19 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
                 algorithm(algo)
                 for ablation in ablations_of(task, args.config) if args.ablations else [args.ablation]:
                     run = load_config(algo, task, args.config, overrides, ablation)
-                    steps = args.n_timesteps or run.n_timesteps
-                    yield _job(args, algo, name, seed, ablation, steps)
+                    run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps)
+                    yield _job(args, run, name, seed, ablation)
 
 
-def _job(args: argparse.Namespace, algo: str, env: str, seed: int, ablation: str | None, n_timesteps: int) -> Job:
-    task, _ = resolve_env(env)
-    variant = args.variant or variant_name(ablation, args.config)
-    arguments = ["--algo", algo, "--env", env, "--seed", str(seed), "--variant", variant, *_shared(args)]
+def _job(args: argparse.Namespace, run: RunConfig, env: str, seed: int, ablation: str | None) -> Job:
+    variant = args.variant or variant_name(run, ablation, args.config)
+    arguments = ["--algo", run.algo, "--env", env, "--seed", str(seed), "--variant", variant, *_shared(args)]
     arguments += ["--ablation", ablation] if ablation else []
     folder, target = (
-        RunFolder.for_run(root.absolute(), task, algo, variant, seed) for root in (args.log_folder, args.ledger)
+        RunFolder.for_run(root.absolute(), run.task, run.algo, variant, seed) for root in (args.log_folder, args.ledger)
     )
-    episodes = evaluated_episodes(args, n_timesteps)
-    return Job(algo, env, seed, folder, target, tuple(arguments), n_timesteps, episodes)
+    episodes = evaluated_episodes(args, run.n_timesteps)
+    return Job(run.algo, env, seed, folder, target, tuple(arguments), run.n_timesteps, episodes)
 
 
 def evaluated_episodes(args: argparse.Namespace, n_timesteps: int) -> int:

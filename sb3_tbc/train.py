@@ -19,7 +19,7 @@ from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm
-from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, OF_PAPER, load_config, parse_overrides
+from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, OF_PAPER, RunConfig, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
@@ -70,7 +70,8 @@ def build_parser() -> Parser:
     where = parser.add_argument_group("where it is kept")
     where.add_argument("--log-folder", type=Path, default=Path("runs"),
                        help="the run goes to <log-folder>/<task>/<algo>/<variant>/seed_<n>")  # fmt: skip
-    where.add_argument("--variant", help="name of the run's folder; by default full, paper, or the ablation")
+    where.add_argument("--variant", help="name of the run's folder; by default full (the shipped settings), "
+                       "custom (others) or the ablation; --config paper adds -paper")  # fmt: skip
     where.add_argument("--overwrite", action="store_true", help="replace an earlier run in the same folder")
     where.add_argument("--resume", type=Path, metavar="RUN", help="continue the run in this folder")
     where.add_argument("--ledger", type=Path, metavar="FOLDER", help="also copy the small result files here at the end")
@@ -115,15 +116,16 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
     overrides |= {"on_bad_step": args.on_bad_step} if args.on_bad_step else {}
     config, file = config_and_file(args)
     run = load_config(args.algo, task, config, overrides, args.ablation, file)
+    run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
+    variant = args.variant or variant_name(run, args.ablation, config)
     if args.ablation is not None:
         matched = match_parameters(run, load_config(args.algo, task, config, overrides, None, file), env_id)
         print(f"{args.ablation}: {matched}")
         run = matched.run
-    run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
     return RunSpec(
         run,
         env_id,
-        variant=args.variant or variant_name(args.ablation, config),
+        variant=variant,
         seed=args.seed,
         eval_freq=args.eval_freq or default_eval_freq(run.n_timesteps),
         n_eval_episodes=args.n_eval_episodes,
@@ -151,9 +153,18 @@ def default_eval_freq(n_timesteps: int) -> int:
     return max(n_timesteps // 40, 500)
 
 
-def variant_name(ablation: str | None, config: str | None) -> str:
-    """Folder name of a variant: ``full`` or the ablation, with ``-paper`` when the tables' values were asked for."""
-    return (ablation or "full") + (OF_PAPER if config == "paper" else "")
+def variant_name(run: RunConfig, ablation: str | None, config: str | None) -> str:
+    """Folder name of a variant, with ``-paper`` when the tables' values were asked for.
+
+    ``full`` has the shipped settings, ``custom`` others; an ablation with others ends with ``-custom``. The number of
+    steps makes no other variant.
+
+    :param run: with all settings that the user gave, before an ablation's networks are given their widths
+    """
+    shipped = load_config(run.algo, run.task, config, ablation=ablation)
+    own = replace(run, n_timesteps=shipped.n_timesteps, config=shipped.config) != shipped
+    parts = [ablation or "", "custom" if own else ""]
+    return ("-".join(filter(None, parts)) or "full") + (OF_PAPER if config == "paper" else "")
 
 
 def describe(result: Plain, folder: RunFolder) -> str:

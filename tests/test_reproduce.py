@@ -33,6 +33,9 @@ def test_ablations_have_folders_of_their_own(tmp_path: Path) -> None:
     job = next(iter(reproduce.jobs(campaign(tmp_path, "--algos", "tbc-hrl", "--ablation", "no-ts"))))
     assert job.target.path.parent.name == "no-ts"
     assert "--ablation no-ts" in " ".join(job.command())
+    job = next(iter(reproduce.jobs(campaign(tmp_path, "--algos", "tbc-hrl", "--ablation", "no-ts", *TINY))))
+    assert job.variant == "no-ts-custom"
+    assert "--variant no-ts-custom" in " ".join(job.command())
 
 
 def test_all_ablations_in_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -84,7 +87,7 @@ def test_a_small_campaign_fills_the_ledger(tmp_path: Path, capsys: pytest.Captur
     arguments = campaign(tmp_path, "--seeds", "1", *small)
     assert reproduce.main(arguments) == 0
     for algo in ("hits", "tbc-hrl"):
-        folder = RunFolder.for_run(tmp_path / "results", "Pendulum", algo, "full", 0)
+        folder = RunFolder.for_run(tmp_path / "results", "Pendulum", algo, "custom", 0)
         assert sorted(p.name for p in folder.path.iterdir()) == sorted(LEDGER_FILES)
     assert reproduce.main(arguments) == 0
     assert "0 to do" in capsys.readouterr().out

@@ -56,7 +56,7 @@ class RunSpec:
 
     :param run: algorithm, task, settings
     :param env_id: environment id of the task
-    :param variant: folder name: ``full``, an ablation, or a name given by the user
+    :param variant: folder name: ``full``, ``custom``, an ablation, or a name given by the user
     :param seed: seed of everything in training
     :param eval_freq: environment steps between evaluations
     :param n_eval_episodes: episodes per evaluation
