@@ -72,7 +72,7 @@ def build_parser() -> Parser:
 
 
 def jobs(argv: Sequence[str]) -> Iterator[Job]:
-    """The runs of a campaign, seeds in the outer loop, so that every task and method has a first seed early.
+    """The runs of a campaign, each once, seeds in the outer loop: every task and method has a first seed early.
 
     :raises ConfigError: for unknown names, before anything runs
     """
@@ -80,6 +80,7 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
     overrides = parse_overrides(args.hyperparams)
     if args.ablations and (args.ablation or args.variant):
         raise ConfigError("--ablations names the runs' folders itself: leave --ablation and --variant out")
+    seen: set[RunFolder] = set()
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         for name in args.tasks:
             task, _ = resolve_env(name)
@@ -88,7 +89,10 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
                 for ablation in ablations_of(task, args.config) if args.ablations else [args.ablation]:
                     run = load_config(algo, task, args.config, overrides, ablation)
                     run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps)
-                    yield _job(args, run, name, seed, ablation)
+                    job = _job(args, run, name, seed, ablation)
+                    if job.folder not in seen:  # a name may be given twice, e.g. Pendulum pendulum
+                        seen.add(job.folder)
+                        yield job
 
 
 def _job(args: argparse.Namespace, run: RunConfig, env: str, seed: int, ablation: str | None) -> Job:

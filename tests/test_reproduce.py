@@ -29,6 +29,11 @@ def test_every_first_seed_comes_before_any_second(tmp_path: Path) -> None:
     assert order == [(0, "hits"), (0, "tbc-hrl"), (1, "hits"), (1, "tbc-hrl")]
 
 
+def test_a_run_that_is_named_twice_is_planned_once(tmp_path: Path) -> None:
+    twice = campaign(tmp_path, "--tasks", "Pendulum", "pendulum", "--algos", "hits", "HiTS", "--seeds", "2")
+    assert [(job.env, job.seed) for job in reproduce.jobs(twice)] == [("Pendulum", 0), ("Pendulum", 1)]
+
+
 def test_ablations_have_folders_of_their_own(tmp_path: Path) -> None:
     job = next(iter(reproduce.jobs(campaign(tmp_path, "--algos", "tbc-hrl", "--ablation", "no-ts"))))
     assert job.target.path.parent.name == "no-ts"

@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from sb3_tbc.campaign.executors import Executor, Handle
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
-from sb3_tbc.commands import INTERRUPTED
+from sb3_tbc.commands import FAILED, INTERRUPTED
+from sb3_tbc.errors import ConfigError, WriteError
+from sb3_tbc.outside import one_line
 
 PAUSE = 0.2
 """Seconds between two looks at the running jobs."""
@@ -53,21 +55,37 @@ class Campaign:
         return self.failed
 
     def _begin(self, job: Job) -> None:
-        if job.folder.finished:  # trained earlier, and stopped before it was copied
+        # trained earlier, and stopped before it was copied; or another campaign was faster
+        if job.folder.finished or job.target.finished:
             self._end(job, 0)
             return
         self.board.begin(job)
-        self.running[job] = self.executor.start(job)
+        try:
+            self.running[job] = self.executor.start(job)
+        except (OSError, ConfigError) as error:
+            self._fail(job, FAILED, one_line(error))
 
     def _end(self, job: Job, status: int) -> None:
-        if status == 0 and job.folder.finished:
-            job.keep_result()
-            self.board.done(job)
+        if (status == 0 and job.folder.finished) or job.target.finished:
+            try:
+                job.keep_result()
+            except (OSError, ValueError) as error:
+                self._fail(job, status, f"its result cannot be copied: {one_line(error)}")
+            else:
+                self.board.done(job)
         elif status == INTERRUPTED:
             self.board.stopped(job)
         else:
-            self.failed.append(job)
-            self.board.fail(job, status, job.keep_failure(status))
+            self._fail(job, status, job.last_line())
+
+    def _fail(self, job: Job, status: int, message: str) -> None:
+        """Record a failure; one that cannot be recorded is told, and ends no other run."""
+        self.failed.append(job)
+        try:
+            job.keep_failure(status, message)
+        except WriteError as error:
+            message += f" ({one_line(error)})"
+        self.board.fail(job, status, message)
 
     def _stop(self) -> None:
         """Ask each run once to stop, and wait until all have saved a checkpoint."""

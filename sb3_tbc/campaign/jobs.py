@@ -63,23 +63,31 @@ class Job:
         return [*train, "--overwrite", *self.arguments]
 
     def keep_result(self) -> None:
-        """Copy the result into the ledger and forget earlier failures."""
-        self.folder.copy_to(self.target)
+        """Copy the result into the ledger, if it is not there yet, and forget earlier failures.
+
+        :raises ConfigError: if the run's folder is not complete
+        :raises WriteError: if the ledger cannot be written
+        """
+        if not self.target.finished:
+            self.folder.copy_to(self.target)
         (self.target.path / FAILED).unlink(missing_ok=True)
 
-    def keep_failure(self, status: int) -> str:
+    def last_line(self) -> str:
+        """The last line that the training command wrote."""
+        text = self.log.read_text(encoding="utf-8", errors="replace").strip() if self.log.is_file() else ""
+        return text.splitlines()[-1] if text else ""
+
+    def keep_failure(self, status: int, message: str) -> None:
         """Record in the ledger that the run failed, and count how often it did.
 
         :param status: exit status of the training command
-        :return: the last line it wrote
+        :param message: what went wrong
+        :raises WriteError: if the ledger cannot be written
         """
         record = self.target.path / FAILED
         attempts = _attempts(record)
-        text = self.log.read_text(encoding="utf-8", errors="replace").strip() if self.log.is_file() else ""
-        last = text.splitlines()[-1] if text else ""
         row = {"task": self.env, "algo": self.algo, "variant": self.variant, "seed": self.seed}
-        write_atomic(record, to_json({**row, "exit_status": status, "attempts": attempts + 1, "message": last}))
-        return last
+        write_atomic(record, to_json({**row, "exit_status": status, "attempts": attempts + 1, "message": message}))
 
 
 def _attempts(record: Path) -> int:

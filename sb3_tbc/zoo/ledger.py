@@ -193,7 +193,9 @@ class RunFolder:
         return self.exists and not self.finished and (has_checkpoint(self.path) or self.model.is_file())
 
     def start(self, config: PlainMapping, command: str) -> None:
-        """Write versions, command and configuration; a folder with a configuration counts as a run."""
+        """Write versions, command, an empty curve where there is none, and last the configuration: it makes a run."""
+        if not self.evaluations.is_file():
+            write_evaluations(self.evaluations, [])
         write_atomic(self.path / VERSIONS, to_json(versions()))
         write_atomic(self.path / COMMAND, command + "\n")
         write_atomic(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
@@ -279,9 +281,11 @@ class RunFolder:
     def copy_to(self, target: RunFolder) -> None:
         """Copy the small text files, e.g. into the committed ledger.
 
-        :raises ConfigError: if it already holds a result
+        :raises ConfigError: if it already holds a result, or one of the files is missing here
         """
         target.require_empty()
+        if missing := [name for name in LEDGER_FILES if not (self.path / name).is_file()]:
+            raise ConfigError(f"{self.path} lacks {missing[0]} and cannot be copied; train it again with --overwrite")
         for name in LEDGER_FILES:
             write_atomic(target.path / name, (self.path / name).read_text(encoding="utf-8"))
 

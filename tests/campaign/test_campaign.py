@@ -139,6 +139,61 @@ def test_a_finished_run_is_only_copied(tmp_path: Path) -> None:
     assert job.target.finished
 
 
+def test_what_another_campaign_finished_meanwhile_is_done(tmp_path: Path) -> None:
+    jobs = [make_job(tmp_path, seed) for seed in range(3)]
+
+    def start(job: Job) -> Finished:
+        for other in jobs[:2]:  # the running one, and one that waits
+            if not other.target.finished:
+                finish(other)
+                other.keep_result()
+        finish(job)
+        return Finished(0)
+
+    executor = Scripted(start)
+    failed, said = carry_out(executor, jobs, workers=1)
+    assert failed == []
+    assert executor.jobs == [0, 2]
+    assert said.count("done    ") == 3
+
+
+def test_a_result_that_cannot_be_kept_is_a_failed_run_and_ends_no_other(tmp_path: Path) -> None:
+    jobs = [make_job(tmp_path, seed) for seed in range(3)]
+    jobs[1].target.path.parent.mkdir(parents=True)
+    jobs[1].target.path.write_text("a file in the ledger's place")
+
+    def start(job: Job) -> Finished:
+        finish(job)
+        if job.seed == 0:
+            job.folder.evaluations.unlink()
+        return Finished(0)
+
+    failed, said = carry_out(Scripted(start), jobs, workers=1)
+    assert [job.seed for job in failed] == [0, 1]
+    assert jobs[2].target.finished
+    assert [p.name for p in jobs[0].target.path.iterdir()] == [FAILED]  # nothing is copied by halves
+    assert (
+        "lacks evaluations.csv and cannot be copied"
+        in json.loads((jobs[0].target.path / FAILED).read_text())["message"]
+    )
+    assert said.count("its result cannot be copied: ") == 2
+
+
+def test_a_run_that_cannot_be_started_has_failed(tmp_path: Path) -> None:
+    jobs = [make_job(tmp_path, seed) for seed in range(2)]
+
+    def start(job: Job) -> Finished:
+        if job.seed == 0:
+            raise PermissionError(13, "Permission denied", str(job.log))
+        finish(job)
+        return Finished(0)
+
+    failed, said = carry_out(Scripted(start), jobs)
+    assert [job.seed for job in failed] == [0]
+    assert "Permission denied" in said
+    assert jobs[1].target.finished
+
+
 def test_no_more_runs_at_a_time_than_workers(tmp_path: Path) -> None:
     going: list[Going] = []
     most = 0

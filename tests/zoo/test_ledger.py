@@ -59,6 +59,8 @@ def test_life_of_a_run(tmp_path: Path) -> None:
     assert folder.exists
     assert not folder.finished
     assert folder.read_config() == {"algo": "a", "model": {"gamma": 0.9}}
+    folder.start({"algo": "a", "model": {"gamma": 0.9}}, "python -m x")  # a resumed run keeps its curve
+    assert folder.read_evaluations()[0] == ROW
     folder.drop_evaluations_after(1500)
     assert folder.read_evaluations() == [ROW]
     folder.finish({"task": "T", "success_rate": 1.0})
@@ -74,6 +76,19 @@ def test_life_of_a_run(tmp_path: Path) -> None:
     (folder.path / "notes.txt").write_text("mine")
     folder.clear()
     assert [p.name for p in folder.path.iterdir()] == ["notes.txt"]
+
+
+def test_a_run_without_evaluations_is_copied_whole_or_not_at_all(tmp_path: Path) -> None:
+    folder, target = (RunFolder.for_run(tmp_path / root, "T", "a", "full", 0) for root in ("runs", "results"))
+    folder.start({"algo": "a"}, "python -m x")
+    folder.finish({"success_rate": 1.0})
+    folder.copy_to(target)
+    assert target.read_evaluations() == []
+    other = RunFolder.for_run(tmp_path / "results", "T", "a", "full", 1)
+    folder.evaluations.unlink()
+    with pytest.raises(ConfigError, match=r"lacks evaluations\.csv and cannot be copied"):
+        folder.copy_to(other)
+    assert not other.path.exists()
 
 
 def test_versions_name_what_matters() -> None:
