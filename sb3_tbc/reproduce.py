@@ -17,7 +17,7 @@ from sb3_tbc.campaign.executors import Executor, LocalExecutor, RayExecutor, Slu
 from sb3_tbc.campaign.hours import plan, read_speeds
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
-from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.commands import FAILED, INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
 from sb3_tbc.train import N_EVAL_EPISODES, default_eval_freq, variant_name
@@ -141,9 +141,9 @@ def _slurm_settings(items: Sequence[str]) -> dict[str, object]:
 def command(argv: Sequence[str]) -> int:
     """Reproduce; see ``--help``."""
     args = build_parser().parse_args(argv)
-    campaign = list(jobs(argv))
-    todo = [job for job in campaign if not job.target.finished]
-    print(f"{len(campaign)} runs, {len(campaign) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
+    planned = list(jobs(argv))
+    todo = [job for job in planned if not job.target.finished]
+    print(f"{len(planned)} runs, {len(planned) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
     if args.dry_run:
         print("\n".join(plan(todo, args.workers, read_speeds(args.ledger), lambda job: job.name)))
         return 0
@@ -153,15 +153,19 @@ def command(argv: Sequence[str]) -> int:
     executor = make_executor(args)
     try:
         with Board(len(todo)) as board:
-            failed = Campaign(executor, args.workers, board).run(todo)
+            campaign = Campaign(executor, args.workers, board)
+            campaign.run(todo)
     except KeyboardInterrupt:
         print("stopped; the same command continues", file=sys.stderr)
         return INTERRUPTED
     finally:
         executor.close()
-    if failed:
-        print(f"{len(failed)} of {len(todo)} runs failed; the same command tries them again", file=sys.stderr)
-    return 1 if failed else 0
+    if campaign.stopped:
+        ended = f"{len(campaign.stopped)} of {len(todo)} runs were stopped from outside"
+        print(f"{ended}; the same command continues them", file=sys.stderr)
+    if campaign.failed:
+        print(f"{len(campaign.failed)} of {len(todo)} runs failed; the same command tries them again", file=sys.stderr)
+    return FAILED if campaign.failed or campaign.stopped else 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

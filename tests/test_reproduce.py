@@ -86,6 +86,30 @@ def test_mistakes_are_told_before_anything_runs(tmp_path: Path, capsys: pytest.C
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_run_that_others_stop_is_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Stopped:
+        def start(self, job: object) -> Stopped:
+            return self
+
+        def poll(self) -> int:
+            return 130
+
+        def stop(self) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(reproduce, "make_executor", lambda args: Stopped())
+    assert reproduce.main(campaign(tmp_path, "--algos", "hits", "--workers", "2")) == 1
+    said = capsys.readouterr()
+    assert said.out.count("stopped Pendulum hits full seed ") == 2
+    assert said.err == "2 of 2 runs were stopped from outside; the same command continues them\n"
+    assert not (tmp_path / "results").exists()
+
+
 @pytest.mark.slow
 def test_a_small_campaign_fills_the_ledger(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--n-timesteps", "300", "--eval-freq", "300", "--n-final-episodes", "1", *TINY]

@@ -31,9 +31,10 @@ class Campaign:
         self.executor, self.workers, self.board = executor, workers, board
         self.running: dict[Job, Handle] = {}
         self.failed: list[Job] = []
+        self.stopped: list[Job] = []  # by others than us, e.g. when a cluster needs its machine
 
     def run(self, todo: Sequence[Job]) -> list[Job]:
-        """Run jobs in order; returns those that failed.
+        """Run jobs in order; returns those that failed. Those that others stopped are in ``stopped``.
 
         :raises KeyboardInterrupt: after Ctrl-C, when the runs are stopped
         """
@@ -74,6 +75,7 @@ class Campaign:
             else:
                 self.board.done(job)
         elif status == INTERRUPTED:
+            self.stopped.append(job)
             self.board.stopped(job)
         else:
             self._fail(job, status, job.last_line())
