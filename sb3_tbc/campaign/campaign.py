@@ -30,6 +30,7 @@ class Campaign:
     def __init__(self, executor: Executor, workers: int, board: Board) -> None:
         self.executor, self.workers, self.board = executor, workers, board
         self.running: dict[Job, Handle] = {}
+        self.log_sizes: dict[Job, int] = {}  # before the run began: what earlier attempts wrote, in bytes
         self.failed: list[Job] = []
         self.stopped: list[Job] = []  # by others than us, e.g. when a cluster needs its machine
 
@@ -61,6 +62,7 @@ class Campaign:
             self._end(job, 0)
             return
         self.board.begin(job)
+        self.log_sizes[job] = job.log.stat().st_size if job.log.is_file() else 0
         try:
             self.running[job] = self.executor.start(job)
         except (OSError, ConfigError) as error:
@@ -78,7 +80,7 @@ class Campaign:
             self.stopped.append(job)
             self.board.stopped(job)
         else:
-            self._fail(job, status, job.last_line())
+            self._fail(job, status, job.last_line(self.log_sizes[job]))
 
     def _fail(self, job: Job, status: int, message: str) -> None:
         """Record a failure; one that cannot be recorded is told, and ends no other run."""

@@ -72,9 +72,13 @@ class Job:
             self.folder.copy_to(self.target)
         (self.target.path / FAILED).unlink(missing_ok=True)
 
-    def last_line(self) -> str:
-        """The last line that the training command wrote."""
-        text = self.log.read_text(encoding="utf-8", errors="replace").strip() if self.log.is_file() else ""
+    def last_line(self, skip: int = 0) -> str:
+        """The last line that the training command wrote; empty if it was killed before it wrote any.
+
+        :param skip: bytes of the log that earlier attempts wrote
+        """
+        written = self.log.read_bytes()[skip:] if self.log.is_file() else b""
+        text = written.decode("utf-8", "replace").strip()
         return text.splitlines()[-1] if text else ""
 
     def keep_failure(self, status: int, message: str) -> None:

@@ -125,6 +125,23 @@ def test_results_go_to_the_ledger_and_failures_are_recorded(tmp_path: Path) -> N
     assert not (jobs[2].target.path / FAILED).exists()
 
 
+def test_a_run_that_is_killed_in_silence_has_no_message_of_an_earlier_attempt(tmp_path: Path) -> None:
+    job = make_job(tmp_path)
+
+    def start(job: Job) -> Finished:
+        job.folder.path.mkdir(parents=True, exist_ok=True)
+        with job.log.open("a") as log:
+            log.write(next(said))
+        return Finished(-9)
+
+    said = iter(("begin\ndisk full\n", "", "begin\n"))
+    messages = []
+    for _ in range(3):
+        carry_out(Scripted(start), [job])
+        messages.append(json.loads((job.target.path / FAILED).read_text())["message"])
+    assert messages == ["disk full", "", "begin"]
+
+
 def test_a_run_that_ends_well_without_a_result_has_failed(tmp_path: Path) -> None:
     failed, _ = carry_out(Scripted(lambda job: Finished(0)), [make_job(tmp_path)])
     assert len(failed) == 1
