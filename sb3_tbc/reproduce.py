@@ -1,7 +1,8 @@
 """``python -m sb3_tbc.reproduce``: the paper's experiments, on this machine, as jobs of Slurm, or on a Ray cluster.
 
 Results go to the ledger. A stopped campaign is continued by the same command: finished runs are never repeated; failed
-ones are recorded in the ledger, counted, and tried again.
+ones are recorded in the ledger, counted, and tried again. A run in the log folder that was made with other settings is
+neither continued nor copied.
 """
 
 from __future__ import annotations
@@ -20,11 +21,13 @@ from sb3_tbc.campaign.progress import Board
 from sb3_tbc.commands import FAILED, INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
-from sb3_tbc.train import N_EVAL_EPISODES, default_eval_freq, variant_name
+from sb3_tbc.train import N_EVAL_EPISODES, build_spec, default_eval_freq, variant_name
+from sb3_tbc.train import build_parser as build_train_parser
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
 from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, RunConfig, ablations_of, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env, task_names
 from sb3_tbc.zoo.ledger import RunFolder
+from sb3_tbc.zoo.runner import RunSpec
 
 EXAMPLES = {
     "sb3_tbc.reproduce --dry-run": "what would run, and how many hours it takes",
@@ -106,6 +109,14 @@ def _job(args: argparse.Namespace, run: RunConfig, env: str, seed: int, ablation
     return Job(run.algo, env, seed, folder, target, tuple(arguments), run.n_timesteps, episodes)
 
 
+def wanted_run(job: Job) -> RunSpec:
+    """The run that a job's training command makes.
+
+    :raises ConfigError: for wrong values
+    """
+    return build_spec(build_train_parser().parse_args(job.arguments), tell=lambda line: None)
+
+
 def evaluated_episodes(args: argparse.Namespace, n_timesteps: int) -> int:
     """Episodes of all evaluations of a run of ``n_timesteps``."""
     along = n_timesteps // (args.eval_freq or default_eval_freq(n_timesteps))
@@ -153,7 +164,7 @@ def command(argv: Sequence[str]) -> int:
     executor = make_executor(args)
     try:
         with Board(len(todo)) as board:
-            campaign = Campaign(executor, args.workers, board)
+            campaign = Campaign(executor, args.workers, board, wanted_run)
             campaign.run(todo)
     except KeyboardInterrupt:
         print("stopped; the same command continues", file=sys.stderr)

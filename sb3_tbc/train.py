@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -104,9 +104,10 @@ class ListAction(argparse.Action):
         parser.exit()
 
 
-def build_spec(args: argparse.Namespace) -> RunSpec:
+def build_spec(args: argparse.Namespace, tell: Callable[[str], object] = print) -> RunSpec:
     """From arguments to a run.
 
+    :param tell: called with a line about an ablation's parameters
     :raises ConfigError: for unknown names and wrong values
     """
     args.algo = args.algo.lower()
@@ -120,7 +121,7 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
     variant = args.variant or variant_name(run, args.ablation, config)
     if args.ablation is not None:
         matched = match_parameters(run, load_config(args.algo, task, config, overrides, None, file), env_id)
-        print(f"{args.ablation}: {matched}")
+        tell(f"{args.ablation}: {matched}")
         run = matched.run
     return RunSpec(
         run,

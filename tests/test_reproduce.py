@@ -110,6 +110,20 @@ def test_a_run_that_others_stop_is_no_success(
     assert not (tmp_path / "results").exists()
 
 
+def test_the_run_that_is_wanted_is_the_one_that_the_command_makes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["--n-timesteps", "300", "--eval-freq", "100", "--n-final-episodes", "1", "--hyperparams", "max_options:3"]
+    arguments = ["--algos", "tbc-hrl", "--ablation", "no-ts", "--seeds", "1", *small]
+    (job,) = reproduce.jobs(campaign(tmp_path, *arguments))
+    spec = reproduce.wanted_run(job)
+    assert (spec.run.n_timesteps, spec.eval_freq, spec.n_final_episodes, spec.seed) == (300, 100, 1, 0)
+    assert (spec.variant, spec.run.model["max_options"]) == (job.variant, 3)
+    assert capsys.readouterr().out == ""
+    job.folder.start(spec.to_dict(), "x")
+    job.require(spec)
+
+
 @pytest.mark.slow
 def test_a_small_campaign_fills_the_ledger(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--n-timesteps", "300", "--eval-freq", "300", "--n-final-episodes", "1", *TINY]

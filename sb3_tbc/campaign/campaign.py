@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from sb3_tbc.campaign.executors import Executor, Handle
 from sb3_tbc.campaign.jobs import Job
@@ -12,6 +12,7 @@ from sb3_tbc.campaign.progress import Board
 from sb3_tbc.commands import FAILED, INTERRUPTED
 from sb3_tbc.errors import ConfigError, WriteError
 from sb3_tbc.outside import one_line
+from sb3_tbc.zoo.runner import RunSpec
 
 PAUSE = 0.2
 """Seconds between two looks at the running jobs."""
@@ -25,10 +26,11 @@ class Campaign:
     :param executor: where they are carried out
     :param workers: how many at a time
     :param board: where progress is shown
+    :param wanted: the run that a job stands for; a folder with another run is left alone, and its job fails
     """
 
-    def __init__(self, executor: Executor, workers: int, board: Board) -> None:
-        self.executor, self.workers, self.board = executor, workers, board
+    def __init__(self, executor: Executor, workers: int, board: Board, wanted: Callable[[Job], RunSpec]) -> None:
+        self.executor, self.workers, self.board, self.wanted = executor, workers, board, wanted
         self.running: dict[Job, Handle] = {}
         self.log_sizes: dict[Job, int] = {}  # before the run began: what earlier attempts wrote, in bytes
         self.failed: list[Job] = []
@@ -57,13 +59,17 @@ class Campaign:
         return self.failed
 
     def _begin(self, job: Job) -> None:
-        # trained earlier, and stopped before it was copied; or another campaign was faster
-        if job.folder.finished or job.target.finished:
+        if job.target.finished:  # another campaign was faster
             self._end(job, 0)
             return
-        self.board.begin(job)
-        self.log_sizes[job] = job.log.stat().st_size if job.log.is_file() else 0
         try:
+            if job.holds_run:
+                job.require(self.wanted(job))
+            if job.folder.finished:  # trained earlier, and stopped before it was copied
+                self._end(job, 0)
+                return
+            self.board.begin(job)
+            self.log_sizes[job] = job.log.stat().st_size if job.log.is_file() else 0
             self.running[job] = self.executor.start(job)
         except (OSError, ConfigError) as error:
             self._fail(job, FAILED, one_line(error))
