@@ -27,6 +27,11 @@ from sb3_tbc.zoo.settings_page import settings_text
 
 N_EVAL_EPISODES = 20
 """Episodes of each evaluation along the curve, where nothing else is said."""
+NOT_RESUMED = (
+    *("algo", "env", "seed", "n_envs", "config", "config_file", "ablation", "hyperparams", "on_bad_step"),
+    *("eval_freq", "n_eval_episodes", "n_final_episodes", "log_folder", "variant", "overwrite"),
+)
+"""Options that say what a new run is; a resumed one has them from its ``config.yml``."""
 EXAMPLES = {
     "sb3_tbc.train": "TBC-HRL on Pendulum; the run is kept in runs/Pendulum/tbc-hrl/full/seed_0",
     "sb3_tbc.train --list": "which tasks and algorithms there are, and how long a run takes",
@@ -73,7 +78,8 @@ def build_parser() -> Parser:
     where.add_argument("--variant", help="name of the run's folder; by default full (the shipped settings), "
                        "custom (others) or the ablation; --config paper adds -paper")  # fmt: skip
     where.add_argument("--overwrite", action="store_true", help="replace an earlier run in the same folder")
-    where.add_argument("--resume", type=Path, metavar="RUN", help="continue the run in this folder")
+    where.add_argument("--resume", type=Path, metavar="RUN", help="continue the run in this folder as it was begun; "
+                       "--n-timesteps may extend it")  # fmt: skip
     where.add_argument("--ledger", type=Path, metavar="FOLDER", help="also copy the small result files here at the end")
     where.add_argument("--trace", action="store_true", help="write every option of training to options.csv, which the "
                        "report draws")  # fmt: skip
@@ -227,15 +233,29 @@ def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> 
 
 
 def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> tuple[RunFolder, Plain]:
+    line = shlex.join(["python", "-m", "sb3_tbc.train", *argv])
     if args.resume is not None:
+        _refuse_settings(argv)
         folder = RunFolder(args.resume)
-        return folder, resume_run(folder, options, args.n_timesteps)
+        return folder, resume_run(folder, options, args.n_timesteps, line)
     spec = build_spec(args)
     folder = RunFolder.for_run(args.log_folder, spec.run.task, spec.run.algo, spec.variant, spec.seed)
-    line = shlex.join(["python", "-m", "sb3_tbc.train", *argv])
     if args.ledger is not None:
         _ledger_folder(args.ledger, spec.identity).require_empty()
     return folder, start_run(spec, folder, line, options, args.overwrite)
+
+
+def _refuse_settings(argv: Sequence[str]) -> None:
+    """Refuse what a resumed run would ignore.
+
+    :raises ConfigError: naming the first such option
+    """
+    # argparse gives no default to what a namespace has already, so that None is an option that was not given
+    given = build_parser().parse_args(argv, argparse.Namespace(**dict.fromkeys(NOT_RESUMED)))
+    if named := [name for name in NOT_RESUMED if getattr(given, name) is not None]:
+        option = f"--{named[0].replace('_', '-')}"
+        cure = f"leave {option} out, or begin another run without --resume"
+        raise ConfigError(f"{option} cannot be changed by --resume, which goes on as the run's config.yml says; {cure}")
 
 
 def _ledger_folder(ledger: Path, identity: Plain) -> RunFolder:

@@ -203,6 +203,41 @@ def test_resume_goes_on_and_keeps_the_curve(run: RunFolder, tmp_path: Path) -> N
     assert copy.read_evaluations()[:2] == run.read_evaluations()
     assert copy.read_evaluations()[2].wall_time > run.read_evaluations()[1].wall_time
     assert not copy.checkpoint.exists()
+    lines = (copy.path / "command.txt").read_text().splitlines()
+    assert lines[0] == (run.path / "command.txt").read_text().strip()
+    assert lines[1:] == [f"python -m sb3_tbc.train --resume {copy.path} --n-timesteps 600 --no-progress"]
+    assert (copy.path / "versions.json").read_text() == (run.path / "versions.json").read_text()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ["--algo", "hits"],
+        ["--env", "UR5Reacher"],
+        ["--seed", "0"],
+        ["--hyperparams", "low.gamma:0.5"],
+        ["--eval-freq", "100"],
+        ["--n-eval-episodes", "20"],
+        ["--n-envs", "2"],
+        ["--config-file", "mine.yml"],
+        ["--on-bad-step", "stop"],
+        ["--log-folder", "runs"],
+        ["--overwrite"],
+    ],
+)
+def test_resume_refuses_what_it_would_ignore(
+    given: list[str], run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (run.path / "config.yml").read_text()
+    assert train.main(["--resume", str(run.path), "--n-timesteps", "600", *given]) == 2
+    assert f"{given[0]} cannot be changed by --resume, which goes on as the run's config.yml says" in said(capsys)
+    assert (run.path / "config.yml").read_text() == before
+
+
+def test_every_option_is_a_setting_of_the_run_or_one_of_how_it_is_carried_out() -> None:
+    of_how = {"n_timesteps", "resume", "ledger", "trace", "tensorboard", "checkpoint_minutes", "keep_checkpoint"}
+    of_how |= {"device", "num_threads", "progress", "trust", "help_settings"}
+    assert set(vars(train.build_parser().parse_args([]))) - {"list"} == of_how | set(train.NOT_RESUMED)
 
 
 def test_resume_without_a_checkpoint(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
