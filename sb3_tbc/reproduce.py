@@ -1,7 +1,8 @@
 """``python -m sb3_tbc.reproduce``: the paper's experiments, on this machine, as jobs of Slurm, or on a Ray cluster.
 
 Results go to the ledger. A stopped campaign is continued by the same command: finished runs are never repeated; failed
-ones are recorded in the ledger, counted, and tried again.
+ones are recorded in the ledger, counted, and tried again. A run in the log folder that was made with other settings is
+neither continued nor copied.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from sb3_tbc.campaign.campaign import Campaign
@@ -16,14 +18,16 @@ from sb3_tbc.campaign.executors import Executor, LocalExecutor, RayExecutor, Slu
 from sb3_tbc.campaign.hours import plan, read_speeds
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
-from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.commands import FAILED, INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
-from sb3_tbc.train import N_EVAL_EPISODES, default_eval_freq, variant_name
+from sb3_tbc.train import N_EVAL_EPISODES, build_spec, default_eval_freq, variant_name
+from sb3_tbc.train import build_parser as build_train_parser
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
-from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, ablations_of, load_config, parse_overrides
+from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, RunConfig, ablations_of, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env, task_names
 from sb3_tbc.zoo.ledger import RunFolder
+from sb3_tbc.zoo.runner import RunSpec
 
 EXAMPLES = {
     "sb3_tbc.reproduce --dry-run": "what would run, and how many hours it takes",
@@ -51,7 +55,7 @@ def build_parser() -> Parser:
     add("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
     add("--ablations", action="store_true", help="every ablation that changes something in a task's settings; "
         "needs --algos tbc-hrl")  # fmt: skip
-    add("--variant", help="name of the runs' folder; by default from --config and --ablation")
+    add("--variant", help="name of the runs' folder; by default as in sb3_tbc.train")
     add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as in sb3_tbc.train")
     add("--n-timesteps", type=positive_int, help="environment steps of each run; by default the task's")
     add("--eval-freq", type=positive_int, help="steps between evaluations; by default a fortieth of the run")
@@ -71,7 +75,7 @@ def build_parser() -> Parser:
 
 
 def jobs(argv: Sequence[str]) -> Iterator[Job]:
-    """The runs of a campaign, seeds in the outer loop, so that every task and method has a first seed early.
+    """The runs of a campaign, each once, seeds in the outer loop: every task and method has a first seed early.
 
     :raises ConfigError: for unknown names, before anything runs
     """
@@ -79,6 +83,7 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
     overrides = parse_overrides(args.hyperparams)
     if args.ablations and (args.ablation or args.variant):
         raise ConfigError("--ablations names the runs' folders itself: leave --ablation and --variant out")
+    seen: set[RunFolder] = set()
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         for name in args.tasks:
             task, _ = resolve_env(name)
@@ -86,20 +91,30 @@ def jobs(argv: Sequence[str]) -> Iterator[Job]:
                 algorithm(algo)
                 for ablation in ablations_of(task, args.config) if args.ablations else [args.ablation]:
                     run = load_config(algo, task, args.config, overrides, ablation)
-                    steps = args.n_timesteps or run.n_timesteps
-                    yield _job(args, algo, name, seed, ablation, steps)
+                    run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps)
+                    job = _job(args, run, name, seed, ablation)
+                    if job.folder not in seen:  # a name may be given twice, e.g. Pendulum pendulum
+                        seen.add(job.folder)
+                        yield job
 
 
-def _job(args: argparse.Namespace, algo: str, env: str, seed: int, ablation: str | None, n_timesteps: int) -> Job:
-    task, _ = resolve_env(env)
-    variant = args.variant or variant_name(ablation, args.config)
-    arguments = ["--algo", algo, "--env", env, "--seed", str(seed), "--variant", variant, *_shared(args)]
+def _job(args: argparse.Namespace, run: RunConfig, env: str, seed: int, ablation: str | None) -> Job:
+    variant = args.variant or variant_name(run, ablation, args.config)
+    arguments = ["--algo", run.algo, "--env", env, "--seed", str(seed), "--variant", variant, *_shared(args)]
     arguments += ["--ablation", ablation] if ablation else []
     folder, target = (
-        RunFolder.for_run(root.absolute(), task, algo, variant, seed) for root in (args.log_folder, args.ledger)
+        RunFolder.for_run(root.absolute(), run.task, run.algo, variant, seed) for root in (args.log_folder, args.ledger)
     )
-    episodes = evaluated_episodes(args, n_timesteps)
-    return Job(algo, env, seed, folder, target, tuple(arguments), n_timesteps, episodes)
+    episodes = evaluated_episodes(args, run.n_timesteps)
+    return Job(run.algo, env, seed, folder, target, tuple(arguments), run.n_timesteps, episodes)
+
+
+def wanted_run(job: Job) -> RunSpec:
+    """The run that a job's training command makes.
+
+    :raises ConfigError: for wrong values
+    """
+    return build_spec(build_train_parser().parse_args(job.arguments), tell=lambda line: None)
 
 
 def evaluated_episodes(args: argparse.Namespace, n_timesteps: int) -> int:
@@ -137,9 +152,9 @@ def _slurm_settings(items: Sequence[str]) -> dict[str, object]:
 def command(argv: Sequence[str]) -> int:
     """Reproduce; see ``--help``."""
     args = build_parser().parse_args(argv)
-    campaign = list(jobs(argv))
-    todo = [job for job in campaign if not job.target.finished]
-    print(f"{len(campaign)} runs, {len(campaign) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
+    planned = list(jobs(argv))
+    todo = [job for job in planned if not job.target.finished]
+    print(f"{len(planned)} runs, {len(planned) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
     if args.dry_run:
         print("\n".join(plan(todo, args.workers, read_speeds(args.ledger), lambda job: job.name)))
         return 0
@@ -149,15 +164,19 @@ def command(argv: Sequence[str]) -> int:
     executor = make_executor(args)
     try:
         with Board(len(todo)) as board:
-            failed = Campaign(executor, args.workers, board).run(todo)
+            campaign = Campaign(executor, args.workers, board, wanted_run)
+            campaign.run(todo)
     except KeyboardInterrupt:
         print("stopped; the same command continues", file=sys.stderr)
         return INTERRUPTED
     finally:
         executor.close()
-    if failed:
-        print(f"{len(failed)} of {len(todo)} runs failed; the same command tries them again", file=sys.stderr)
-    return 1 if failed else 0
+    if campaign.stopped:
+        ended = f"{len(campaign.stopped)} of {len(todo)} runs were stopped from outside"
+        print(f"{ended}; the same command continues them", file=sys.stderr)
+    if campaign.failed:
+        print(f"{len(campaign.failed)} of {len(todo)} runs failed; the same command tries them again", file=sys.stderr)
+    return FAILED if campaign.failed or campaign.stopped else 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm
-from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, OF_PAPER, load_config, parse_overrides
+from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, OF_PAPER, RunConfig, load_config, parse_overrides
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
@@ -27,6 +27,11 @@ from sb3_tbc.zoo.settings_page import settings_text
 
 N_EVAL_EPISODES = 20
 """Episodes of each evaluation along the curve, where nothing else is said."""
+NOT_RESUMED = (
+    *("algo", "env", "seed", "n_envs", "config", "config_file", "ablation", "hyperparams", "on_bad_step"),
+    *("eval_freq", "n_eval_episodes", "n_final_episodes", "log_folder", "variant", "overwrite"),
+)
+"""Options that say what a new run is; a resumed one has them from its ``config.yml``."""
 EXAMPLES = {
     "sb3_tbc.train": "TBC-HRL on Pendulum; the run is kept in runs/Pendulum/tbc-hrl/full/seed_0",
     "sb3_tbc.train --list": "which tasks and algorithms there are, and how long a run takes",
@@ -70,9 +75,11 @@ def build_parser() -> Parser:
     where = parser.add_argument_group("where it is kept")
     where.add_argument("--log-folder", type=Path, default=Path("runs"),
                        help="the run goes to <log-folder>/<task>/<algo>/<variant>/seed_<n>")  # fmt: skip
-    where.add_argument("--variant", help="name of the run's folder; by default full, paper, or the ablation")
+    where.add_argument("--variant", help="name of the run's folder; by default full (the shipped settings), "
+                       "custom (others) or the ablation; --config paper adds -paper")  # fmt: skip
     where.add_argument("--overwrite", action="store_true", help="replace an earlier run in the same folder")
-    where.add_argument("--resume", type=Path, metavar="RUN", help="continue the run in this folder")
+    where.add_argument("--resume", type=Path, metavar="RUN", help="continue the run in this folder as it was begun; "
+                       "--n-timesteps may extend it")  # fmt: skip
     where.add_argument("--ledger", type=Path, metavar="FOLDER", help="also copy the small result files here at the end")
     where.add_argument("--trace", action="store_true", help="write every option of training to options.csv, which the "
                        "report draws")  # fmt: skip
@@ -103,9 +110,10 @@ class ListAction(argparse.Action):
         parser.exit()
 
 
-def build_spec(args: argparse.Namespace) -> RunSpec:
+def build_spec(args: argparse.Namespace, tell: Callable[[str], object] = print) -> RunSpec:
     """From arguments to a run.
 
+    :param tell: called with a line about an ablation's parameters
     :raises ConfigError: for unknown names and wrong values
     """
     args.algo = args.algo.lower()
@@ -115,15 +123,16 @@ def build_spec(args: argparse.Namespace) -> RunSpec:
     overrides |= {"on_bad_step": args.on_bad_step} if args.on_bad_step else {}
     config, file = config_and_file(args)
     run = load_config(args.algo, task, config, overrides, args.ablation, file)
+    run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
+    variant = args.variant or variant_name(run, args.ablation, config)
     if args.ablation is not None:
         matched = match_parameters(run, load_config(args.algo, task, config, overrides, None, file), env_id)
-        print(f"{args.ablation}: {matched}")
+        tell(f"{args.ablation}: {matched}")
         run = matched.run
-    run = replace(run, n_timesteps=args.n_timesteps or run.n_timesteps, n_envs=args.n_envs or run.n_envs)
     return RunSpec(
         run,
         env_id,
-        variant=args.variant or variant_name(args.ablation, config),
+        variant=variant,
         seed=args.seed,
         eval_freq=args.eval_freq or default_eval_freq(run.n_timesteps),
         n_eval_episodes=args.n_eval_episodes,
@@ -151,9 +160,18 @@ def default_eval_freq(n_timesteps: int) -> int:
     return max(n_timesteps // 40, 500)
 
 
-def variant_name(ablation: str | None, config: str | None) -> str:
-    """Folder name of a variant: ``full`` or the ablation, with ``-paper`` when the tables' values were asked for."""
-    return (ablation or "full") + (OF_PAPER if config == "paper" else "")
+def variant_name(run: RunConfig, ablation: str | None, config: str | None) -> str:
+    """Folder name of a variant, with ``-paper`` when the tables' values were asked for.
+
+    ``full`` has the shipped settings, ``custom`` others; an ablation with others ends with ``-custom``. The number of
+    steps makes no other variant.
+
+    :param run: with all settings that the user gave, before an ablation's networks are given their widths
+    """
+    shipped = load_config(run.algo, run.task, config, ablation=ablation)
+    own = replace(run, n_timesteps=shipped.n_timesteps, config=shipped.config) != shipped
+    parts = [ablation or "", "custom" if own else ""]
+    return ("-".join(filter(None, parts)) or "full") + (OF_PAPER if config == "paper" else "")
 
 
 def describe(result: Plain, folder: RunFolder) -> str:
@@ -215,15 +233,29 @@ def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> 
 
 
 def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> tuple[RunFolder, Plain]:
+    line = shlex.join(["python", "-m", "sb3_tbc.train", *argv])
     if args.resume is not None:
+        _refuse_settings(argv)
         folder = RunFolder(args.resume)
-        return folder, resume_run(folder, options, args.n_timesteps)
+        return folder, resume_run(folder, options, args.n_timesteps, line)
     spec = build_spec(args)
     folder = RunFolder.for_run(args.log_folder, spec.run.task, spec.run.algo, spec.variant, spec.seed)
-    line = shlex.join(["python", "-m", "sb3_tbc.train", *argv])
     if args.ledger is not None:
         _ledger_folder(args.ledger, spec.identity).require_empty()
     return folder, start_run(spec, folder, line, options, args.overwrite)
+
+
+def _refuse_settings(argv: Sequence[str]) -> None:
+    """Refuse what a resumed run would ignore.
+
+    :raises ConfigError: naming the first such option
+    """
+    # argparse gives no default to what a namespace has already, so that None is an option that was not given
+    given = build_parser().parse_args(argv, argparse.Namespace(**dict.fromkeys(NOT_RESUMED)))
+    if named := [name for name in NOT_RESUMED if getattr(given, name) is not None]:
+        option = f"--{named[0].replace('_', '-')}"
+        cure = f"leave {option} out, or begin another run without --resume"
+        raise ConfigError(f"{option} cannot be changed by --resume, which goes on as the run's config.yml says; {cure}")
 
 
 def _ledger_folder(ledger: Path, identity: Plain) -> RunFolder:

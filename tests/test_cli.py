@@ -35,7 +35,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(root: Path) -> RunFolder:
-    return RunFolder.for_run(root, "Pendulum", "tbc-hrl", "full", 5)
+    return RunFolder.for_run(root, "Pendulum", "tbc-hrl", "custom", 5)
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> str:
@@ -52,7 +52,8 @@ def test_a_run_leaves_everything_behind(run: RunFolder) -> None:
     assert {"model.zip", "best_model.zip", "progress.csv", "options.csv", "checkpoint"} <= names
     final = run.read_final()
     assert set(PINNED) <= set(final)
-    assert (final["task"], final["algo"], final["variant"], final["config"]) == ("Pendulum", "tbc-hrl", "full", "tuned")
+    expected = ("Pendulum", "tbc-hrl", "custom", "tuned")
+    assert (final["task"], final["algo"], final["variant"], final["config"]) == expected
     assert (final["seed"], final["n_timesteps"], final["n_episodes"]) == (5, 400, 2)
     assert [row.timesteps for row in run.read_evaluations()] == [200, 400]
     assert run.read_config()["model"]["low"]["batch_size"] == 16
@@ -76,7 +77,7 @@ def test_evaluate_prints_a_summary_for_people(run: RunFolder, capsys: pytest.Cap
     arguments = [str(run.model), "--n-episodes", "2", "--seed", str(run.read_final()["eval_seed"])]
     assert evaluate.main(arguments) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0] == "agent            tbc-hrl (full), 400 training steps on Pendulum"
+    assert lines[0] == "agent            tbc-hrl (custom), 400 training steps on Pendulum"
     assert lines[1].startswith(f"success rate     {run.read_final()['success_rate']:.2f}  (")
     assert "of 2 episodes; 95 % interval" in lines[1]
     assert 4 <= len(lines) <= 6
@@ -147,6 +148,36 @@ def test_names_without_regard_to_case(capsys: pytest.CaptureFixture[str]) -> Non
     assert (spec.run.algo, spec.run.task) == ("hits", "Drawbridge")
 
 
+@pytest.mark.parametrize(
+    ("arguments", "variant"),
+    [
+        ([], "full"),
+        (["--n-timesteps", "500", "--hyperparams", "n_timesteps:600"], "full"),
+        (["--config", "paper"], "full-paper"),
+        (["--hyperparams", "learning_rate:1e-2"], "custom"),
+        (["--config", "paper", "--on-bad-step", "end-episode"], "custom-paper"),
+        (["--n-envs", "3"], "custom"),
+        (["--hyperparams", "learning_rate:1e-2", "--variant", "quick"], "quick"),
+    ],
+)
+def test_settings_of_ones_own_have_a_variant_of_their_own(arguments: list[str], variant: str) -> None:
+    assert train.build_spec(train.build_parser().parse_args(["--algo", "sac", *arguments])).variant == variant
+
+
+def test_a_file_of_ones_own_is_a_variant_only_where_it_differs(tmp_path: Path) -> None:
+    from sb3_tbc.zoo.config import config_file
+
+    copy = tmp_path / "mine.yml"
+    shutil.copy(config_file("sac"), copy)
+    args = train.build_parser().parse_args(["--algo", "sac", "--config", str(copy)])
+    assert train.build_spec(args).variant == "full"
+    sections = yaml.safe_load(copy.read_text())
+    sections["Pendulum"]["tuned"]["gamma"] = 0.5
+    copy.write_text(yaml.safe_dump(sections))
+    for given in (["--config", str(copy)], ["--config", "tuned", "--config-file", str(copy)]):
+        assert train.build_spec(train.build_parser().parse_args(["--algo", "sac", *given])).variant == "custom"
+
+
 def test_evaluate_in_a_new_process(run: RunFolder, tmp_path: Path) -> None:
     out = tmp_path / "e.json"
     seed = str(run.read_final()["eval_seed"])
@@ -172,6 +203,41 @@ def test_resume_goes_on_and_keeps_the_curve(run: RunFolder, tmp_path: Path) -> N
     assert copy.read_evaluations()[:2] == run.read_evaluations()
     assert copy.read_evaluations()[2].wall_time > run.read_evaluations()[1].wall_time
     assert not copy.checkpoint.exists()
+    lines = (copy.path / "command.txt").read_text().splitlines()
+    assert lines[0] == (run.path / "command.txt").read_text().strip()
+    assert lines[1:] == [f"python -m sb3_tbc.train --resume {copy.path} --n-timesteps 600 --no-progress"]
+    assert (copy.path / "versions.json").read_text() == (run.path / "versions.json").read_text()
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ["--algo", "hits"],
+        ["--env", "UR5Reacher"],
+        ["--seed", "0"],
+        ["--hyperparams", "low.gamma:0.5"],
+        ["--eval-freq", "100"],
+        ["--n-eval-episodes", "20"],
+        ["--n-envs", "2"],
+        ["--config-file", "mine.yml"],
+        ["--on-bad-step", "stop"],
+        ["--log-folder", "runs"],
+        ["--overwrite"],
+    ],
+)
+def test_resume_refuses_what_it_would_ignore(
+    given: list[str], run: RunFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (run.path / "config.yml").read_text()
+    assert train.main(["--resume", str(run.path), "--n-timesteps", "600", *given]) == 2
+    assert f"{given[0]} cannot be changed by --resume, which goes on as the run's config.yml says" in said(capsys)
+    assert (run.path / "config.yml").read_text() == before
+
+
+def test_every_option_is_a_setting_of_the_run_or_one_of_how_it_is_carried_out() -> None:
+    of_how = {"n_timesteps", "resume", "ledger", "trace", "tensorboard", "checkpoint_minutes", "keep_checkpoint"}
+    of_how |= {"device", "num_threads", "progress", "trust", "help_settings"}
+    assert set(vars(train.build_parser().parse_args([]))) - {"list"} == of_how | set(train.NOT_RESUMED)
 
 
 def test_resume_without_a_checkpoint(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -203,7 +269,7 @@ def test_ctrl_c_saves_and_resume_finishes(
     monkeypatch.setattr(SuccessEvalCallback, "_on_step", interrupt)
     arguments = ["--algo", "hits", "--config", "paper", "--n-timesteps", "300", "--log-folder", str(tmp_path)]
     assert train.main([*arguments, *SHORT, *TINY]) == 130
-    folder = RunFolder.for_run(tmp_path, "Pendulum", "hits", "full-paper", 0)
+    folder = RunFolder.for_run(tmp_path, "Pendulum", "hits", "custom-paper", 0)
     assert f"--resume {folder.path}" in capsys.readouterr().err
     assert not folder.finished
     monkeypatch.setattr(SuccessEvalCallback, "_on_step", original)
@@ -212,7 +278,7 @@ def test_ctrl_c_saves_and_resume_finishes(
     ledger = tmp_path / "results"
     assert train.main(["--resume", str(folder.path), "--no-progress", "--ledger", str(ledger)]) == 0
     assert folder.read_final()["n_timesteps"] == 300
-    assert RunFolder.for_run(ledger, "Pendulum", "hits", "full-paper", 0).finished
+    assert RunFolder.for_run(ledger, "Pendulum", "hits", "custom-paper", 0).finished
 
 
 @pytest.mark.parametrize(
@@ -324,7 +390,7 @@ def test_baselines_go_through_the_same_doors(algo: str, tmp_path: Path, capsys: 
     printed = capsys.readouterr().out
     assert ("subgoals reached" in printed) == (algo == "hac")
     assert "nan" not in printed
-    folder = RunFolder.for_run(tmp_path, "Drawbridge", algo, "full", 0)
+    folder = RunFolder.for_run(tmp_path, "Drawbridge", algo, "custom", 0)
     final = folder.read_final()
     assert final["algo"] == algo
     assert (final["subgoal_success"] is None) == (algo == "sac")
@@ -342,6 +408,6 @@ def test_ablations_print_their_parameters(tmp_path: Path, capsys: pytest.Capture
     arguments = ["--ablation", "no-ndbc", "--n-timesteps", "200", "--log-folder", str(tmp_path)]
     assert train.main([*arguments, *SHORT, *TINY]) == 0
     assert "no-ndbc: " in capsys.readouterr().out
-    folder = RunFolder.for_run(tmp_path, "Pendulum", "tbc-hrl", "no-ndbc", 0)
-    assert folder.read_final()["variant"] == "no-ndbc"
+    folder = RunFolder.for_run(tmp_path, "Pendulum", "tbc-hrl", "no-ndbc-custom", 0)
+    assert folder.read_final()["variant"] == "no-ndbc-custom"
     assert folder.read_config()["model"]["low"]["policy_kwargs"]["ndbc"] is None

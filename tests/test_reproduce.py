@@ -29,10 +29,18 @@ def test_every_first_seed_comes_before_any_second(tmp_path: Path) -> None:
     assert order == [(0, "hits"), (0, "tbc-hrl"), (1, "hits"), (1, "tbc-hrl")]
 
 
+def test_a_run_that_is_named_twice_is_planned_once(tmp_path: Path) -> None:
+    twice = campaign(tmp_path, "--tasks", "Pendulum", "pendulum", "--algos", "hits", "HiTS", "--seeds", "2")
+    assert [(job.env, job.seed) for job in reproduce.jobs(twice)] == [("Pendulum", 0), ("Pendulum", 1)]
+
+
 def test_ablations_have_folders_of_their_own(tmp_path: Path) -> None:
     job = next(iter(reproduce.jobs(campaign(tmp_path, "--algos", "tbc-hrl", "--ablation", "no-ts"))))
     assert job.target.path.parent.name == "no-ts"
     assert "--ablation no-ts" in " ".join(job.command())
+    job = next(iter(reproduce.jobs(campaign(tmp_path, "--algos", "tbc-hrl", "--ablation", "no-ts", *TINY))))
+    assert job.variant == "no-ts-custom"
+    assert "--variant no-ts-custom" in " ".join(job.command())
 
 
 def test_all_ablations_in_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -78,13 +86,51 @@ def test_mistakes_are_told_before_anything_runs(tmp_path: Path, capsys: pytest.C
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_run_that_others_stop_is_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Stopped:
+        def start(self, job: object) -> Stopped:
+            return self
+
+        def poll(self) -> int:
+            return 130
+
+        def stop(self) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(reproduce, "make_executor", lambda args: Stopped())
+    assert reproduce.main(campaign(tmp_path, "--algos", "hits", "--workers", "2")) == 1
+    said = capsys.readouterr()
+    assert said.out.count("stopped Pendulum hits full seed ") == 2
+    assert said.err == "2 of 2 runs were stopped from outside; the same command continues them\n"
+    assert not (tmp_path / "results").exists()
+
+
+def test_the_run_that_is_wanted_is_the_one_that_the_command_makes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    small = ["--n-timesteps", "300", "--eval-freq", "100", "--n-final-episodes", "1", "--hyperparams", "max_options:3"]
+    arguments = ["--algos", "tbc-hrl", "--ablation", "no-ts", "--seeds", "1", *small]
+    (job,) = reproduce.jobs(campaign(tmp_path, *arguments))
+    spec = reproduce.wanted_run(job)
+    assert (spec.run.n_timesteps, spec.eval_freq, spec.n_final_episodes, spec.seed) == (300, 100, 1, 0)
+    assert (spec.variant, spec.run.model["max_options"]) == (job.variant, 3)
+    assert capsys.readouterr().out == ""
+    job.folder.start(spec.to_dict(), "x")
+    job.require(spec)
+
+
 @pytest.mark.slow
 def test_a_small_campaign_fills_the_ledger(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     small = ["--n-timesteps", "300", "--eval-freq", "300", "--n-final-episodes", "1", *TINY]
     arguments = campaign(tmp_path, "--seeds", "1", *small)
     assert reproduce.main(arguments) == 0
     for algo in ("hits", "tbc-hrl"):
-        folder = RunFolder.for_run(tmp_path / "results", "Pendulum", algo, "full", 0)
+        folder = RunFolder.for_run(tmp_path / "results", "Pendulum", algo, "custom", 0)
         assert sorted(p.name for p in folder.path.iterdir()) == sorted(LEDGER_FILES)
     assert reproduce.main(arguments) == 0
     assert "0 to do" in capsys.readouterr().out

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from sb3_tbc.campaign.executors import Executor, Handle
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
-from sb3_tbc.commands import INTERRUPTED
+from sb3_tbc.commands import FAILED, INTERRUPTED
+from sb3_tbc.errors import ConfigError, WriteError
+from sb3_tbc.outside import one_line
+from sb3_tbc.zoo.runner import RunSpec
 
 PAUSE = 0.2
 """Seconds between two looks at the running jobs."""
@@ -23,15 +26,18 @@ class Campaign:
     :param executor: where they are carried out
     :param workers: how many at a time
     :param board: where progress is shown
+    :param wanted: the run that a job stands for; a folder with another run is left alone, and its job fails
     """
 
-    def __init__(self, executor: Executor, workers: int, board: Board) -> None:
-        self.executor, self.workers, self.board = executor, workers, board
+    def __init__(self, executor: Executor, workers: int, board: Board, wanted: Callable[[Job], RunSpec]) -> None:
+        self.executor, self.workers, self.board, self.wanted = executor, workers, board, wanted
         self.running: dict[Job, Handle] = {}
+        self.log_sizes: dict[Job, int] = {}  # before the run began: what earlier attempts wrote, in bytes
         self.failed: list[Job] = []
+        self.stopped: list[Job] = []  # by others than us, e.g. when a cluster needs its machine
 
     def run(self, todo: Sequence[Job]) -> list[Job]:
-        """Run jobs in order; returns those that failed.
+        """Run jobs in order; returns those that failed. Those that others stopped are in ``stopped``.
 
         :raises KeyboardInterrupt: after Ctrl-C, when the runs are stopped
         """
@@ -53,21 +59,43 @@ class Campaign:
         return self.failed
 
     def _begin(self, job: Job) -> None:
-        if job.folder.finished:  # trained earlier, and stopped before it was copied
+        if job.target.finished:  # another campaign was faster
             self._end(job, 0)
             return
-        self.board.begin(job)
-        self.running[job] = self.executor.start(job)
+        try:
+            if job.holds_run:
+                job.require(self.wanted(job))
+            if job.folder.finished:  # trained earlier, and stopped before it was copied
+                self._end(job, 0)
+                return
+            self.board.begin(job)
+            self.log_sizes[job] = job.log.stat().st_size if job.log.is_file() else 0
+            self.running[job] = self.executor.start(job)
+        except (OSError, ConfigError) as error:
+            self._fail(job, FAILED, one_line(error))
 
     def _end(self, job: Job, status: int) -> None:
-        if status == 0 and job.folder.finished:
-            job.keep_result()
-            self.board.done(job)
+        if (status == 0 and job.folder.finished) or job.target.finished:
+            try:
+                job.keep_result()
+            except (OSError, ValueError) as error:
+                self._fail(job, status, f"its result cannot be copied: {one_line(error)}")
+            else:
+                self.board.done(job)
         elif status == INTERRUPTED:
+            self.stopped.append(job)
             self.board.stopped(job)
         else:
-            self.failed.append(job)
-            self.board.fail(job, status, job.keep_failure(status))
+            self._fail(job, status, job.last_line(self.log_sizes[job]))
+
+    def _fail(self, job: Job, status: int, message: str) -> None:
+        """Record a failure; one that cannot be recorded is told, and ends no other run."""
+        self.failed.append(job)
+        try:
+            job.keep_failure(status, message)
+        except WriteError as error:
+            message += f" ({one_line(error)})"
+        self.board.fail(job, status, message)
 
     def _stop(self) -> None:
         """Ask each run once to stop, and wait until all have saved a checkpoint."""

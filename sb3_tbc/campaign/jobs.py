@@ -6,10 +6,15 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import yaml
+
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_atomic
+from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json
 from sb3_tbc.zoo.ledger import RunFolder, to_json
+from sb3_tbc.zoo.runner import RunSpec
 
 FAILED = "failed.json"
 """File in the ledger's folder of a failed run: exit status, number of attempts and last message."""
@@ -62,24 +67,65 @@ class Job:
             return [*train, "--resume", str(self.folder.path)]
         return [*train, "--overwrite", *self.arguments]
 
+    @property
+    def holds_run(self) -> bool:
+        """Whether the folder holds a run that would be copied or continued, and not replaced."""
+        return self.folder.finished or self.folder.resumable
+
+    def require(self, wanted: RunSpec) -> None:
+        """Refuse a folder with another run: its result is none of the campaign's.
+
+        :param wanted: what the folder must hold
+        :raises ConfigError: naming the first difference, or if the folder's configuration cannot be read
+        """
+        found = RunSpec.from_dict(self.folder.read_config()).to_dict()
+        asked = yaml.safe_load(yaml.safe_dump(wanted.to_dict(), sort_keys=False))  # as the folder has it
+        if difference := first_difference(asked, found):
+            cure = "use another --log-folder, or replace that run with sb3_tbc.train --overwrite"
+            raise ConfigError(f"{self.folder.path} holds another run: {difference}; {cure}")
+
     def keep_result(self) -> None:
-        """Copy the result into the ledger and forget earlier failures."""
-        self.folder.copy_to(self.target)
+        """Copy the result into the ledger, if it is not there yet, and forget earlier failures.
+
+        :raises ConfigError: if the run's folder is not complete
+        :raises WriteError: if the ledger cannot be written
+        """
+        if not self.target.finished:
+            self.folder.copy_to(self.target)
         (self.target.path / FAILED).unlink(missing_ok=True)
 
-    def keep_failure(self, status: int) -> str:
+    def last_line(self, skip: int = 0) -> str:
+        """The last line that the training command wrote; empty if it was killed before it wrote any.
+
+        :param skip: bytes of the log that earlier attempts wrote
+        """
+        written = self.log.read_bytes()[skip:] if self.log.is_file() else b""
+        text = written.decode("utf-8", "replace").strip()
+        return text.splitlines()[-1] if text else ""
+
+    def keep_failure(self, status: int, message: str) -> None:
         """Record in the ledger that the run failed, and count how often it did.
 
         :param status: exit status of the training command
-        :return: the last line it wrote
+        :param message: what went wrong
+        :raises WriteError: if the ledger cannot be written
         """
         record = self.target.path / FAILED
         attempts = _attempts(record)
-        text = self.log.read_text(encoding="utf-8", errors="replace").strip() if self.log.is_file() else ""
-        last = text.splitlines()[-1] if text else ""
         row = {"task": self.env, "algo": self.algo, "variant": self.variant, "seed": self.seed}
-        write_atomic(record, to_json({**row, "exit_status": status, "attempts": attempts + 1, "message": last}))
-        return last
+        write_atomic(record, to_json({**row, "exit_status": status, "attempts": attempts + 1, "message": message}))
+
+
+def first_difference(asked: Plain, found: Plain, section: str = "") -> str:
+    """The first setting that two configurations do not share, with both values; empty if they are equal."""
+    for name in asked | found:
+        one, other = asked.get(name, "nothing"), found.get(name, "nothing")
+        if isinstance(one, dict) and isinstance(other, dict):
+            if inner := first_difference(one, other, f"{section}{name}."):
+                return inner
+        elif one != other:
+            return f"{section}{name} is {one_line(other)} there, not {one_line(one)}"
+    return ""
 
 
 def _attempts(record: Path) -> int:

@@ -79,7 +79,7 @@ def build_parser() -> Parser:
     add("--log-folder", type=Path, default=Path("runs/tune"), help="runs go to <folder>/<study>/trial_<n>/seed_<s>")
     add("--device", default="cpu", help="torch device")
     add("--trial", metavar="best|N", help="do not search: train on this trial's settings with --seed")
-    add("--seed", type=int, default=0, help="with --trial: seed of the training")
+    add("--seed", type=int, help="with --trial: seed of the training; by default the first after those of the search")
     add("--overwrite", action="store_true", help="with --trial: replace an earlier run of that trial and seed")
     same = parser.add_argument_group(
         "what all trials share", "fixed when a study begins; not needed when it is continued"
@@ -237,6 +237,8 @@ def command(argv: Sequence[str]) -> int:
     args.algo = args.algo.lower()
     if not args.minutes > 0:
         raise ConfigError(f"--minutes must be above 0, got {args.minutes:g}")
+    if args.seed is not None and args.trial is None:
+        raise ConfigError(f"--seed {args.seed} belongs to --trial; a search takes its seeds from --first-seed")
     th.set_num_threads(1)
     from sb3_tbc.tune.pruning import make_pruner
 
@@ -293,12 +295,12 @@ def summarise(study: Study, settings: StudySettings, folder: Path) -> None:
         print(f"note           all {len(done)} trials have the same value; a larger --n-timesteps may tell them apart")
     print(f"best           {settings.objective} {best.value:.4g}   (trial {best.number})")
     print(f"settings       {path}")
-    print(f"its curve      {shlex.join(['python', '-m', 'sb3_tbc.train', *train_arguments(settings, path)])}")
+    again = shlex.join(["python", "-m", "sb3_tbc.train", *train_arguments(settings, path, settings.first_seed)])
+    print(f"its curve      {again}")
 
 
-def train_arguments(settings: StudySettings, path: Path, seed: int | None = None) -> list[str]:
-    """Arguments of the training command that repeats a trial's first seed."""
-    seed = settings.first_seed if seed is None else seed
+def train_arguments(settings: StudySettings, path: Path, seed: int) -> list[str]:
+    """Arguments of the training command that trains on a trial's settings."""
     arguments = ["--algo", settings.algo, "--env", settings.env, "--config", str(path), "--seed", str(seed)]
     arguments += ["--eval-freq", str(settings.eval_freq), "--n-eval-episodes", str(settings.n_eval_episodes)]
     return [*arguments, "--variant", path.stem]
@@ -312,7 +314,10 @@ def train_from(args: argparse.Namespace, study: Study, settings: StudySettings, 
     trial = find_trial(study, args.trial)
     path = write_trial(settings, trial, study.study_name, folder / f"trial_{trial.number:04d}.yml")
     print(f"settings       {path}   (trial {trial.number})", flush=True)
-    arguments = train_arguments(settings, path, args.seed)
+    seed = settings.seeds.stop if args.seed is None else args.seed
+    if seed in settings.seeds:
+        print(f"note           seed {seed} is one of those on which the trials were chosen; results on it are biased")
+    arguments = train_arguments(settings, path, seed)
     arguments += ["--log-folder", str(folder / "train"), "--device", args.device]
     arguments += ["--n-timesteps", str(args.n_timesteps)] if args.n_timesteps else []
     return train.command([*arguments, *(["--overwrite"] if args.overwrite else [])])

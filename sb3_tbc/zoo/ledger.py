@@ -34,6 +34,8 @@ CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL = (
     "evaluations.csv",
     "final.json",
 )
+RESUMED = "resumed"
+"""In ``versions.json``: the versions of a run's later parts, where they are not those before."""
 LEDGER_FILES = (CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL)
 SOURCES = (":/sb3_tbc", ":/tasks", ":/zoo_configs")
 PACKAGES = (
@@ -193,9 +195,16 @@ class RunFolder:
         return self.exists and not self.finished and (has_checkpoint(self.path) or self.model.is_file())
 
     def start(self, config: PlainMapping, command: str) -> None:
-        """Write versions, command and configuration; a folder with a configuration counts as a run."""
-        write_atomic(self.path / VERSIONS, to_json(versions()))
-        write_atomic(self.path / COMMAND, command + "\n")
+        """Write versions, command, an empty curve where there is none, and last the configuration: it makes a run.
+
+        Of a run that goes on, the first versions and command stay; others follow, under ``resumed`` and in a new line.
+
+        :raises ConfigError: if the versions of a run that goes on cannot be read
+        """
+        if not self.evaluations.is_file():
+            write_evaluations(self.evaluations, [])
+        write_atomic(self.path / VERSIONS, to_json(self._all_versions()))
+        write_atomic(self.path / COMMAND, "".join(f"{line}\n" for line in (*self._commands(), command) if line))
         write_atomic(self.path / CONFIG, yaml.safe_dump(dict(config), sort_keys=False))
 
     def clear(self) -> None:
@@ -235,11 +244,19 @@ class RunFolder:
         """The learning curve, empty before the first evaluation."""
         return read_evaluations(self.evaluations)
 
-    @property
-    def command_line(self) -> str:
-        """The command with which the run was started; empty if it is not known."""
+    def _commands(self) -> list[str]:
         path = self.path / COMMAND
-        return path.read_text(encoding="utf-8", errors="replace").strip() if path.is_file() else ""
+        return path.read_text(encoding="utf-8", errors="replace").strip().split("\n") if path.is_file() else []
+
+    def _all_versions(self) -> Plain:
+        """The versions with which the run was begun, and under ``resumed`` those of later parts where they changed."""
+        now, path = versions(), self.path / VERSIONS
+        first = _read(path, read_json) if path.is_file() else now
+        later = first.pop(RESUMED, [])
+        if not isinstance(later, list):
+            raise ConfigError(f"{path}: {RESUMED} must be a list, got {type(later).__name__}")
+        later += [now] if now != [first, *later][-1] else []
+        return {**first, RESUMED: later} if later else first
 
     def reopen(self, timesteps: int) -> None:
         """Rename files that a run resumed from this step writes anew; an earlier result keeps its step in its name."""
@@ -279,9 +296,11 @@ class RunFolder:
     def copy_to(self, target: RunFolder) -> None:
         """Copy the small text files, e.g. into the committed ledger.
 
-        :raises ConfigError: if it already holds a result
+        :raises ConfigError: if it already holds a result, or one of the files is missing here
         """
         target.require_empty()
+        if missing := [name for name in LEDGER_FILES if not (self.path / name).is_file()]:
+            raise ConfigError(f"{self.path} lacks {missing[0]} and cannot be copied; train it again with --overwrite")
         for name in LEDGER_FILES:
             write_atomic(target.path / name, (self.path / name).read_text(encoding="utf-8"))
 

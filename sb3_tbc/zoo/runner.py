@@ -56,7 +56,7 @@ class RunSpec:
 
     :param run: algorithm, task, settings
     :param env_id: environment id of the task
-    :param variant: folder name: ``full``, an ablation, or a name given by the user
+    :param variant: folder name: ``full``, ``custom``, an ablation, or a name given by the user
     :param seed: seed of everything in training
     :param eval_freq: environment steps between evaluations
     :param n_eval_episodes: episodes per evaluation
@@ -185,12 +185,13 @@ def _check_new(folder: RunFolder, overwrite: bool) -> None:
         raise ConfigError(f"{folder.path} holds {state}; nothing was changed. Use {cure}")
 
 
-def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None = None) -> Plain:
+def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None = None, command: str = "") -> Plain:
     """Resume a run from its last undamaged checkpoint, or evaluate it if only that is missing.
 
     Of a finished run the result is returned, so that a script can call this until all runs are done.
 
     :param n_timesteps: a new total of environment steps
+    :param command: what is added to ``command.txt`` if it changes the total
     :raises ConfigError: if there is no checkpoint, or the run is beyond ``n_timesteps``
     :raises WriteError: if the folder cannot be written, or the disk is full
     :raises Interrupted: when stopped, after the checkpoint is written
@@ -199,6 +200,7 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
     spec = RunSpec.from_dict(folder.read_config())
     if folder.finished and n_timesteps in (None, spec.run.n_timesteps):
         return folder.read_final()
+    command = "" if n_timesteps in (None, spec.run.n_timesteps) else command
     if n_timesteps is not None:
         spec = replace(spec, run=replace(spec.run, n_timesteps=n_timesteps))
     with locked(folder.path):
@@ -206,7 +208,7 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
             folder.tidy()
         if not folder.finished and _trained(folder) >= spec.run.n_timesteps:
             return _only_evaluate(spec, folder, options)
-        return _go_on(spec, folder, options)
+        return _go_on(spec, folder, options, command)
 
 
 def _trained(folder: RunFolder) -> int:
@@ -231,7 +233,7 @@ def _only_evaluate(spec: RunSpec, folder: RunFolder, options: RunOptions) -> Pla
     return finish(model, spec, folder, options, rows[-1].wall_time if rows else 0.0)
 
 
-def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> Plain:
+def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions, command: str) -> Plain:
     checkpoint = find_checkpoint(folder.path)
     if checkpoint is None:
         again = "start it with --keep-checkpoint to be able to extend a finished run"
@@ -247,7 +249,7 @@ def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions) -> Plain:
         keep_only(folder.path, checkpoint)
         with explained(folder.path):
             folder.reopen(done)
-        folder.start(spec.to_dict(), folder.command_line)
+        folder.start(spec.to_dict(), command)
         return Training(model, spec, folder, options, checkpoint.wall_time).run()
     finally:
         env.close()

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 from rich.console import Console
 
 from sb3_tbc.campaign import campaign as campaigns
@@ -24,7 +25,9 @@ from sb3_tbc.campaign.jobs import FAILED, Job
 from sb3_tbc.campaign.progress import Board
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import MissingExtraError
+from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.ledger import LEDGER_FILES, RunFolder
+from sb3_tbc.zoo.runner import RunSpec
 
 
 def make_job(tmp_path: Path, seed: int = 0, env: str = "Pendulum") -> Job:
@@ -32,11 +35,17 @@ def make_job(tmp_path: Path, seed: int = 0, env: str = "Pendulum") -> Job:
     return Job("hits", env, seed, folder, target, ("--seed", str(seed)), 1000)
 
 
+def wanted(job: Job) -> RunSpec:
+    run = replace(load_config("hits", "Pendulum"), n_timesteps=1000)
+    return RunSpec(run, "sb3_tbc/Pendulum-v0", "full", job.seed)
+
+
 def finish(job: Job) -> None:
     """Leave behind what a finished training leaves behind."""
     job.folder.path.mkdir(parents=True, exist_ok=True)
     for name in LEDGER_FILES:
         (job.folder.path / name).write_text("{}")
+    (job.folder.path / "config.yml").write_text(yaml.safe_dump(wanted(job).to_dict()))
     (job.folder.path / "final.json").write_text('{"success_rate": 0.5, "n_timesteps": 1000}')
 
 
@@ -83,7 +92,7 @@ def no_pause(monkeypatch: pytest.MonkeyPatch) -> None:
 def carry_out(executor: object, jobs: list[Job], workers: int = 2) -> tuple[list[Job], str]:
     said = io.StringIO()
     with Board(len(jobs), Console(file=said, width=300)) as board:
-        failed = Campaign(executor, workers, board).run(jobs)  # type: ignore[arg-type]
+        failed = Campaign(executor, workers, board, wanted).run(jobs)  # type: ignore[arg-type]
     return failed, said.getvalue()
 
 
@@ -125,6 +134,23 @@ def test_results_go_to_the_ledger_and_failures_are_recorded(tmp_path: Path) -> N
     assert not (jobs[2].target.path / FAILED).exists()
 
 
+def test_a_run_that_is_killed_in_silence_has_no_message_of_an_earlier_attempt(tmp_path: Path) -> None:
+    job = make_job(tmp_path)
+
+    def start(job: Job) -> Finished:
+        job.folder.path.mkdir(parents=True, exist_ok=True)
+        with job.log.open("a") as log:
+            log.write(next(said))
+        return Finished(-9)
+
+    said = iter(("begin\ndisk full\n", "", "begin\n"))
+    messages = []
+    for _ in range(3):
+        carry_out(Scripted(start), [job])
+        messages.append(json.loads((job.target.path / FAILED).read_text())["message"])
+    assert messages == ["disk full", "", "begin"]
+
+
 def test_a_run_that_ends_well_without_a_result_has_failed(tmp_path: Path) -> None:
     failed, _ = carry_out(Scripted(lambda job: Finished(0)), [make_job(tmp_path)])
     assert len(failed) == 1
@@ -137,6 +163,91 @@ def test_a_finished_run_is_only_copied(tmp_path: Path) -> None:
     assert carry_out(executor, [job])[0] == []
     assert executor.jobs == []
     assert job.target.finished
+
+
+def test_what_another_campaign_finished_meanwhile_is_done(tmp_path: Path) -> None:
+    jobs = [make_job(tmp_path, seed) for seed in range(3)]
+
+    def start(job: Job) -> Finished:
+        for other in jobs[:2]:  # the running one, and one that waits
+            if not other.target.finished:
+                finish(other)
+                other.keep_result()
+        finish(job)
+        return Finished(0)
+
+    executor = Scripted(start)
+    failed, said = carry_out(executor, jobs, workers=1)
+    assert failed == []
+    assert executor.jobs == [0, 2]
+    assert said.count("done    ") == 3
+
+
+def test_a_result_that_cannot_be_kept_is_a_failed_run_and_ends_no_other(tmp_path: Path) -> None:
+    jobs = [make_job(tmp_path, seed) for seed in range(3)]
+    jobs[1].target.path.parent.mkdir(parents=True)
+    jobs[1].target.path.write_text("a file in the ledger's place")
+
+    def start(job: Job) -> Finished:
+        finish(job)
+        if job.seed == 0:
+            job.folder.evaluations.unlink()
+        return Finished(0)
+
+    failed, said = carry_out(Scripted(start), jobs, workers=1)
+    assert [job.seed for job in failed] == [0, 1]
+    assert jobs[2].target.finished
+    assert [p.name for p in jobs[0].target.path.iterdir()] == [FAILED]  # nothing is copied by halves
+    assert (
+        "lacks evaluations.csv and cannot be copied"
+        in json.loads((jobs[0].target.path / FAILED).read_text())["message"]
+    )
+    assert said.count("its result cannot be copied: ") == 2
+
+
+def test_a_run_that_cannot_be_started_has_failed(tmp_path: Path) -> None:
+    jobs = [make_job(tmp_path, seed) for seed in range(2)]
+
+    def start(job: Job) -> Finished:
+        if job.seed == 0:
+            raise PermissionError(13, "Permission denied", str(job.log))
+        finish(job)
+        return Finished(0)
+
+    failed, said = carry_out(Scripted(start), jobs)
+    assert [job.seed for job in failed] == [0]
+    assert "Permission denied" in said
+    assert jobs[1].target.finished
+
+
+def test_a_folder_with_another_run_is_left_alone(tmp_path: Path) -> None:
+    shorter, other, unreadable, same = (make_job(tmp_path, seed) for seed in range(4))
+    config = wanted(shorter).to_dict() | {"n_timesteps": 600, "eval_freq": 50}
+    shorter.folder.start(config, "x")
+    shorter.folder.finish({"success_rate": 1.0, "n_timesteps": 600})
+    config = wanted(other).to_dict()
+    other.folder.start({**config, "model": {**config["model"], "low": {"gamma": 0.5}}}, "x")
+    other.folder.model.write_bytes(b"")  # unfinished: it would be continued
+    finish(unreadable)
+    (unreadable.folder.path / "config.yml").write_text("x: 1")
+    same.folder.start(wanted(same).to_dict(), "x")
+    same.folder.model.write_bytes(b"")
+
+    def start(job: Job) -> Finished:
+        finish(job)
+        return Finished(0)
+
+    executor = Scripted(start)
+    failed, said = carry_out(executor, [shorter, other, unreadable, same])
+    assert failed == [shorter, other, unreadable]
+    assert executor.jobs == [same.seed]
+    messages = [json.loads((job.target.path / FAILED).read_text())["message"] for job in failed]
+    told = "holds another run: n_timesteps is 600 there, not 1000; use another --log-folder"
+    assert messages[0].startswith(f"{shorter.folder.path} {told}")
+    assert "holds another run: model.low." in messages[1]
+    assert "not a run's config.yml" in messages[2]
+    assert said.count("failed  ") == 3
+    assert not any(job.target.finished for job in failed)
 
 
 def test_no_more_runs_at_a_time_than_workers(tmp_path: Path) -> None:
@@ -160,7 +271,7 @@ def test_no_more_runs_at_a_time_than_workers(tmp_path: Path) -> None:
                 handle.status = 1
 
     with Impatient(6, Console(file=io.StringIO())) as board:
-        Campaign(Scripted(start), 2, board).run([make_job(tmp_path, seed) for seed in range(6)])  # type: ignore[arg-type]
+        Campaign(Scripted(start), 2, board, wanted).run([make_job(tmp_path, seed) for seed in range(6)])  # type: ignore[arg-type]
     assert most <= 2
     assert len(going) == 6
 
@@ -180,7 +291,7 @@ def test_ctrl_c_stops_every_run_once_and_begins_no_other(tmp_path: Path) -> None
     executor = Scripted(lambda job: Counting())
     said = io.StringIO()
     with Interrupted(3, Console(file=said)) as board, pytest.raises(KeyboardInterrupt):
-        Campaign(executor, 2, board).run([make_job(tmp_path, seed) for seed in range(3)])  # type: ignore[arg-type]
+        Campaign(executor, 2, board, wanted).run([make_job(tmp_path, seed) for seed in range(3)])  # type: ignore[arg-type]
     assert executor.jobs == [0, 1]
     assert len(stops) == 2
     assert said.getvalue().count("stopped ") == 2

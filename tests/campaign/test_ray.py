@@ -77,7 +77,7 @@ def test_a_killed_node_loses_nothing(cluster: tuple[Any, Any], tmp_path: Path) -
 
     said = io.StringIO()
     with KillsTheNode(1, Console(file=said, width=300)) as board:
-        failed = Campaign(RayExecutor(), 1, board).run([job])
+        failed = Campaign(RayExecutor(), 1, board, reproduce.wanted_run).run([job])
     assert failed == [], said.getvalue() + job.log.read_text()
     assert board.killed_at is not None, "the run ended before the node was killed"
     final = job.target.read_final()

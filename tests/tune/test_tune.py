@@ -138,11 +138,13 @@ def test_the_best_trial_trains_again_to_the_same_curve(searched: Path, tmp_path:
 
 @pytest.mark.parametrize("which", ["0", "1", "best"])
 def test_train_from_a_trial(searched: Path, which: str, capsys: pytest.CaptureFixture[str]) -> None:
-    assert tune.main(arguments(searched, "--trial", which, "--n-timesteps", "100", "--overwrite")) == 0
-    capsys.readouterr()
+    more = ["--seed", "1"] if which == "0" else []
+    assert tune.main(arguments(searched, "--trial", which, "--n-timesteps", "100", "--overwrite", *more)) == 0
+    assert ("seed 1 is one of those on which the trials were chosen" in capsys.readouterr().out) == bool(more)
+    seed = 1 if more else 2  # by default one on which nothing was chosen
     study = load(searched)
     number = find_trial(study, which).number
-    runs = list((searched / NAME / "train").glob(f"*/tbc-hrl/trial_{number:04d}/seed_0/config.yml"))
+    runs = list((searched / NAME / "train").glob(f"*/tbc-hrl/trial_{number:04d}/seed_{seed}/config.yml"))
     assert len(runs) == 1
     model = yaml.safe_load(runs[0].read_text())["model"]
     assert model == read_settings(study).config_of(study.trials[number]).model
@@ -193,6 +195,7 @@ def test_mistakes_on_an_existing_study(
         (["--storage", "nosuchdb://me:secret@host/db"], "cannot open storage nosuchdb://me:***@host/db"),
         (["--storage", "nosuchdb://host/db?password=secret&x=1"], "nosuchdb://host/db?password=***&x=1"),
         (["--n-timesteps", "200", "--eval-freq", "300"], "--eval-freq must be at most the 200 steps of a run"),
+        (["--seed", "3"], "--seed 3 belongs to --trial; a search takes its seeds from --first-seed"),
         (["--minutes", "0"], "--minutes must be above 0, got 0"),
         (["--minutes", "nan"], "--minutes must be above 0, got nan"),
         (["--storage", "sqlite:////no/such/folder/study.db"], "cannot open storage sqlite:////no/such/folder/study.db"),

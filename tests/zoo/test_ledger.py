@@ -59,6 +59,8 @@ def test_life_of_a_run(tmp_path: Path) -> None:
     assert folder.exists
     assert not folder.finished
     assert folder.read_config() == {"algo": "a", "model": {"gamma": 0.9}}
+    folder.start({"algo": "a", "model": {"gamma": 0.9}}, "")  # a resumed run keeps its curve
+    assert folder.read_evaluations()[0] == ROW
     folder.drop_evaluations_after(1500)
     assert folder.read_evaluations() == [ROW]
     folder.finish({"task": "T", "success_rate": 1.0})
@@ -74,6 +76,35 @@ def test_life_of_a_run(tmp_path: Path) -> None:
     (folder.path / "notes.txt").write_text("mine")
     folder.clear()
     assert [p.name for p in folder.path.iterdir()] == ["notes.txt"]
+
+
+def test_a_run_without_evaluations_is_copied_whole_or_not_at_all(tmp_path: Path) -> None:
+    folder, target = (RunFolder.for_run(tmp_path / root, "T", "a", "full", 0) for root in ("runs", "results"))
+    folder.start({"algo": "a"}, "python -m x")
+    folder.finish({"success_rate": 1.0})
+    folder.copy_to(target)
+    assert target.read_evaluations() == []
+    other = RunFolder.for_run(tmp_path / "results", "T", "a", "full", 1)
+    folder.evaluations.unlink()
+    with pytest.raises(ConfigError, match=r"lacks evaluations\.csv and cannot be copied"):
+        folder.copy_to(other)
+    assert not other.path.exists()
+
+
+def test_a_resumed_run_keeps_its_first_versions_and_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = RunFolder(tmp_path)
+    commits = iter(("one", "one", "two", "two", "one"))
+    monkeypatch.setattr(ledger, "_commit", lambda: next(commits))
+    for command in ("python -m x", "", "python -m x --resume", "", ""):
+        folder.start({}, command)
+    versions = json.loads((tmp_path / "versions.json").read_text())
+    assert versions["commit"] == "one"
+    assert [later["commit"] for later in versions["resumed"]] == ["two", "one"]
+    assert (tmp_path / "command.txt").read_text() == "python -m x\npython -m x --resume\n"
+    (tmp_path / "versions.json").write_text(to_json({**versions, "resumed": 3}))
+    commits = iter(["one"])
+    with pytest.raises(ConfigError, match="resumed must be a list, got int"):
+        folder.start({}, "")
 
 
 def test_versions_name_what_matters() -> None:
