@@ -179,9 +179,10 @@ def _row(method: str, runs: Sequence[Run], said: str, notes: Sequence[str]) -> s
     for run in runs:
         packages = run.versions.get("packages") or {}
         parts = [f"{name} {version}" for name, version in packages.items()]
-        parts += [f"commit {run.commit}"] if run.versions else []
+        parts += [f"commit {commit}" for commit in run.commits if run.versions]
         parts += [str(run.versions[key]) for key in ("python", "cpu") if run.versions.get(key)]
-        lines.append(f"<p>seed {run.seed}: <code>{escape(run.command or 'command unknown')}</code><br>")
+        command = escape(run.command or "command unknown").replace("\n", "<br>")
+        lines.append(f"<p>seed {run.seed}: <code>{command}</code><br>")
         lines.append(f'<span class="soft">{escape(", ".join(parts))}</span></p>')
     return "".join([*lines, "</details>"])
 

@@ -19,7 +19,7 @@ from sb3_tbc.reading import read_json, read_text, read_yaml
 from sb3_tbc.report.checked import check_final, check_sections
 from sb3_tbc.zoo.callbacks import EvaluationRow
 from sb3_tbc.zoo.config import OF_PAPER, merge
-from sb3_tbc.zoo.ledger import COMMAND, VERSIONS, RunFolder, finished_runs
+from sb3_tbc.zoo.ledger import COMMAND, RESUMED, VERSIONS, RunFolder, finished_runs
 from sb3_tbc.zoo.schema import CONFIG_CLASSES
 
 OURS = "tbc-hrl"
@@ -85,14 +85,16 @@ class Run(NamedTuple):
         return [int(digit) for digit in text] if isinstance(text, str) and text else None
 
     @property
-    def commit(self) -> str:
-        """Commit of the code, with ``+`` if files had been changed; ``unknown`` outside a checkout."""
-        return str(self.versions.get("commit") or "unknown")
+    def commits(self) -> list[str]:
+        """Commits of the code, with ``+`` if files had been changed, ``unknown`` outside a checkout: the run's beginning,
+        then the parts that went on with other versions.
+        """
+        return [str(part.get("commit") or "unknown") for part in (self.versions, *self.versions.get(RESUMED, []))]
 
     @property
     def dirty(self) -> bool:
-        """Whether the commit does not determine the code."""
-        return self.commit.endswith("+") or self.commit == "unknown"
+        """Whether the commits do not determine the code."""
+        return any(commit.endswith("+") or commit == "unknown" for commit in self.commits)
 
 
 def method_name(algo: str, variant: str) -> str:
@@ -171,6 +173,8 @@ def _load(folder: RunFolder) -> Run:
         raise ValueError(f"{VERSIONS} must hold named values, got {type(versions).__name__}")
     check_sections(config, "model", "env_kwargs", "model.high", "model.low")
     check_sections(versions, "packages")
+    for part in versions.get(RESUMED, []):
+        check_sections({RESUMED: part}, RESUMED)
     return Run(final, folder.read_evaluations(), config, command, versions, folder.path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from pathlib import Path
@@ -286,12 +287,17 @@ def test_rows_say_which_seeds_are_from_uncommitted_code(tmp_path: Path) -> None:
     fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
     fake_run(tmp_path, "A", "tbc-hrl", 1, 1.0, commit="0123abcd+")
     fake_run(tmp_path, "A", "tbc-hrl", 2, 1.0, config={"n_envs": 2})
+    resumed = fake_run(tmp_path, "A", "tbc-hrl", 3, 1.0).path / "versions.json"
+    resumed.write_text(json.dumps({"commit": "0123abcd", "resumed": [{"commit": "4567cdef+"}]}))
     methods = load_results(tmp_path)["A"]
     notes = notes_of_row(methods["tbc-hrl"], methods)
     assert notes == [
         "environments: 1 or 2, depending on the seed",
-        "seed 1: code with changes that were not committed",
+        "seed 1, 3: code with changes that were not committed",
     ]
+    resumed.write_text(json.dumps({"commit": "0123abcd", "resumed": ["4567cdef"]}))
+    with pytest.raises(ConfigError, match="resumed must hold named values"):
+        load_results(tmp_path)
 
 
 def test_tuning_seeds_are_left_out_or_named(tmp_path: Path) -> None:
