@@ -86,8 +86,9 @@ class Run(NamedTuple):
 
     @property
     def commits(self) -> list[str]:
-        """Commits of the code, with ``+`` if files had been changed, ``unknown`` outside a checkout: the run's beginning,
-        then the parts that went on with other versions.
+        """Commits of the code, first the beginning's, then those of parts that went on with other versions.
+
+        A ``+`` says that files had been changed; ``unknown`` stands for code outside of a checkout.
         """
         return [str(part.get("commit") or "unknown") for part in (self.versions, *self.versions.get(RESUMED, []))]
 
