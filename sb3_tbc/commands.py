@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import os
 import shutil
 import signal
 import sys
@@ -86,7 +87,14 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path that the terminal cannot show is no reason to fail
     try:
-        return command(sys.argv[1:] if argv is None else argv)
+        try:
+            return command(sys.argv[1:] if argv is None else argv)
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python tries again at its end
+        print(f"{name}: error: broken pipe: what reads the output has ended", file=sys.stderr)
+        return FAILED
     except (ConfigError, WriteError, TrainingError, EnvironmentFault, NonFiniteError) as error:
         line = " ".join(str(error).split())
         print(f"{name}: error: {line}", file=sys.stderr)

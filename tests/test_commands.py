@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import runpy
+import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -117,6 +118,14 @@ def test_defaults_are_said_once(capsys: pytest.CaptureFixture[str]) -> None:
     parser = Parser("x", {"x --y": "why"})
     parser.add_argument("--y", default=3, help="a number; by default three")
     assert "default: 3" not in parser.format_help()
+
+
+def test_output_that_nobody_reads_is_one_line() -> None:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-m", "sb3_tbc.train", "--help-settings"], **pipes) as process:
+        process.stdout.close()  # as head does when it has its lines
+        assert process.stderr.read() == b"sb3_tbc.train: error: broken pipe: what reads the output has ended\n"
+    assert process.returncode == 1
 
 
 def test_list_of_tasks(capsys: pytest.CaptureFixture[str]) -> None:
