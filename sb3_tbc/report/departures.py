@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from sb3_tbc.aliases import PlainMapping
-from sb3_tbc.report.comparisons import difference_of
+from sb3_tbc.report.comparisons import common_threshold, convergence_gain, difference_of
 from sb3_tbc.report.conditions import differences, flat
-from sb3_tbc.report.runs import OURS, Results, read_table
+from sb3_tbc.report.runs import OURS, Results, Run, read_table
 from sb3_tbc.zoo.config import load_config
 
 MEASUREMENTS = "measurements.yml"
@@ -74,10 +74,19 @@ def _measurements(setting: str, task: str, table: Mapping[str, PlainMapping], re
 
 
 def _said(task: str, row: str, results: Results) -> str:
-    ours, theirs = results[task][OURS], results[task][row]
+    ours, theirs = _with_equal_seeds(results[task][OURS], results[task][row])
     gained, unequal = difference_of(ours, theirs), differences(theirs, ours)
-    said = f"{task}: {gained.mean:+.3f} ({gained.low:+.3f} to {gained.high:+.3f}) against {row}"
+    sooner = convergence_gain(ours, theirs, common_threshold(results[task]))
+    steps = "" if sooner is None else f", steps saved: {sooner},"
+    said = f"{task}: {gained.mean:+.3f} ({gained.low:+.3f} to {gained.high:+.3f}){steps} against {row}"
     return f"{said}, which differs in {'; '.join(unequal)}" if unequal else said
+
+
+def _with_equal_seeds(first: Sequence[Run], second: Sequence[Run]) -> tuple[list[Run], list[Run]]:
+    """Runs of the seeds that both rows have, since slow seeds are often slow in both; all runs if they share none."""
+    common = {run.seed for run in first} & {run.seed for run in second}
+    chosen = [[run for run in runs if run.seed in common or not common] for runs in (first, second)]
+    return chosen[0], chosen[1]
 
 
 def departures_table(root: Path, results: Results) -> list[list[str]]:

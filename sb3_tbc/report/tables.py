@@ -31,7 +31,8 @@ NOTES = (
 )
 DEPARTURE_NOTES = (
     "Settings of tbc-hrl that differ between --config paper (its tables and text) and --config tuned (shipped). "
-    "What it is worth: success of the shipped agent minus that of a row with the paper's value, with its 95 % interval."
+    "What it is worth: success of the shipped agent minus that of a row with the paper's value, with its 95 % "
+    "interval, and steps saved to the common threshold; over the seeds that both have, if there are any."
 )
 COMPARISON_NOTES = (
     "Difference: ours minus theirs, with its 95 % interval. p: Welch's test on seeds, two-sided; (Holm): corrected "

@@ -261,12 +261,14 @@ def test_departures_from_the_paper_come_with_their_measurement(tmp_path: Path) -
         fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 0.9)
         fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 0.6, variant="with-memory", config={"n_timesteps": 1000})
         fake_run(tmp_path, "UR5Reacher", "tbc-hrl", seed, 0.9)
+    fake_run(tmp_path, "Pendulum", "tbc-hrl", 3, 0.0)  # a seed that the other row does not have
     (tmp_path / "measurements.yml").write_text("default: {tbc-hrl with-memory: [memory]}")
     header, *rows = departures_table(tmp_path, load_results(tmp_path))
     cells = {(row[0], row[3]): dict(zip(header, row, strict=True)) for row in rows}
     memory = cells["memory", "all"]
     assert (memory["paper"], memory["shipped"]) == ("window", "none")
     assert memory["what it is worth"].startswith("Pendulum: +0.300 (")
+    assert "), steps saved: not reached in 4,000, against tbc-hrl with-memory" in memory["what it is worth"]
     assert memory["what it is worth"].endswith("which differs in training steps: 1,000 (4,000)")
     assert cells["window_end", "all"]["what it is worth"] == "not measured"
     assert cells["max_options", "UR5Reacher"]["paper"] == "24"
