@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import re
-import shlex
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +10,6 @@ import yaml
 from made_up_runs import fake_run
 from sb3_tbc.tasks import make_task
 
-from sb3_tbc import train
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.report import tables
 from sb3_tbc.report.claims import HOLDS, SAME, claims
@@ -27,14 +23,9 @@ from sb3_tbc.report.comparisons import (
     interval_of,
     strongest_baselines,
 )
-from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
-from sb3_tbc.report.departures import departures_of, departures_table
+from sb3_tbc.report.conditions import notes_of_row
 from sb3_tbc.report.paper import load_paper
-from sb3_tbc.report.planned import N_EVAL_EPISODES, eval_freq_of, missing_table
 from sb3_tbc.report.runs import BEGIN_ALIKE, Curve, describe, load_descriptions, load_results, on_union_of_steps
-from sb3_tbc.reproduce import jobs
-from sb3_tbc.train import default_eval_freq
-from sb3_tbc.zoo.config import load_config, merge
 
 ROOT = Path(__file__).parents[2]
 
@@ -193,57 +184,6 @@ def test_few_seeds_pair_the_episodes_that_both_played(tmp_path: Path) -> None:
     assert interval_of(methods["hits"]).low == pytest.approx(0.708, abs=1e-3)
 
 
-def test_unequal_conditions_are_named(tmp_path: Path) -> None:
-    ours = {"env_kwargs": {"observation": "compact"}, "model": {"relative_subgoals": True, "gradient_ratio": 0.25}}
-    theirs = {"env_kwargs": {}, "model": {"gradient_ratio": 0.07}, "n_eval_episodes": 20}
-    for seed in range(2):
-        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, config=ours)
-        fake_run(tmp_path, "A", "hits", seed, 1.0, config=theirs)
-        equal = {**ours, "model": {"gradient_ratio": 0.25, "average_decay": 0.999}}
-        fake_run(tmp_path, "A", "sac", seed, 1.0, config=equal)
-    results = load_results(tmp_path)
-    assert unequal_conditions(results) == {
-        "A": {
-            "hits": [
-                "observation: paper (compact)",
-                "subgoals seen: absolute (relative)",
-                "updates per step: 0.07 (0.25)",
-                "episodes per evaluation: 20 (10)",
-            ]
-        }
-    }
-    assert tables.conditions_table(results)[1][:2] == ["A", "hits"]
-
-
-def test_defaults_are_compared_as_the_values_they_stand_for(tmp_path: Path) -> None:
-    levels = {"high": {"average_decay": 0.999}, "low": {"average_decay": 0.999, "gone_since": 3}, "gradient_ratio": 1}
-    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0, config={"model": levels})
-    fake_run(tmp_path, "A", "hits", 0, 1.0, config={"model": {"high": {"gradient_ratio": 0.5}}})
-    fake_run(tmp_path, "A", "hac", 0, 1.0, config={"model": {}})
-    fake_run(tmp_path, "A", "sac", 0, 1.0, config={"model": {}})
-    assert unequal_conditions(load_results(tmp_path))["A"] == {
-        "hits": ["high level's updates per step: 0.5 (as the low level's)"],
-        "sac": ["weight averaging: 0.0 (0.999)"],
-    }
-
-
-def test_rows_say_whose_settings_they_do_not_have(tmp_path: Path) -> None:
-    model = load_config("tbc-hrl", "Pendulum").model
-    other = {**model, "kappa": 9.0, "dt_min": 7, "reconsider_margin": 3.0, "fixed_duration": 5.0}
-    for variant, settings in (("full", [model, model]), ("others", [model, {**model, "kappa": 9.0}])):
-        for seed, given in enumerate(settings):
-            fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0, variant, config={"model": given})
-    for task in ("Drawbridge", "Foreign"):
-        given = {**load_config("sac", "Drawbridge").model, "tau": 0.5}
-        fake_run(tmp_path, task, "sac", 0, 1.0, config={"model": given})
-    fake_run(tmp_path, "UR5Reacher", "tbc-hrl", 0, 1.0, config={"model": merge(model, other)})
-    notes = {(t, m): notes_of_row(runs, rows) for t, rows in load_results(tmp_path).items() for m, runs in rows.items()}
-    assert notes["Pendulum", "tbc-hrl"] == notes["Foreign", "sac"] == []
-    assert notes["Pendulum", "tbc-hrl others"] == ["settings differ between seeds: kappa"]
-    assert notes["Drawbridge", "sac"][0] == "not the shipped settings: tau"
-    assert re.fullmatch(r"not the shipped settings: \w+, \w+, \w+ and \d+ more", notes["UR5Reacher", "tbc-hrl"][0])
-
-
 def test_comparisons_say_what_is_unequal_in_ablations_too(tmp_path: Path) -> None:
     for seed in range(3):
         fake_run(tmp_path, "Drawbridge", "tbc-hrl", seed, 0.9 + seed / 100)
@@ -254,52 +194,6 @@ def test_comparisons_say_what_is_unequal_in_ablations_too(tmp_path: Path) -> Non
     assert tables.comparison_table([row])[1][-1] == "unequal training steps: 1,000 (4,000)"
     (claim,) = [c for c in claims(results) if "timed subgoals" in c.text]
     assert claim.evidence.endswith("unequal training steps: 1,000 (4,000)")
-
-
-def test_departures_from_the_paper_come_with_their_measurement(tmp_path: Path) -> None:
-    for seed in range(3):
-        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 0.9)
-        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 0.6, variant="with-memory", config={"n_timesteps": 1000})
-        fake_run(tmp_path, "UR5Reacher", "tbc-hrl", seed, 0.9)
-    fake_run(tmp_path, "Pendulum", "tbc-hrl", 3, 0.0)  # a seed that the other row does not have
-    (tmp_path / "measurements.yml").write_text("default: {tbc-hrl with-memory: [memory]}")
-    header, *rows = departures_table(tmp_path, load_results(tmp_path))
-    cells = {(row[0], row[3]): dict(zip(header, row, strict=True)) for row in rows}
-    memory = cells["memory", "all"]
-    assert (memory["paper"], memory["shipped"]) == ("window", "none")
-    assert memory["what it is worth"].startswith("Pendulum: +0.300 (")
-    assert "), steps saved: not reached in 4,000, against tbc-hrl with-memory" in memory["what it is worth"]
-    assert memory["what it is worth"].endswith("which differs in training steps: 1,000 (4,000)")
-    assert cells["window_end", "all"]["what it is worth"] == "not measured"
-    assert cells["max_options", "UR5Reacher"]["paper"] == "24"
-    assert not [row for row in rows if row[1] == row[2]]
-    assert not [row for row in rows if row[0] == "kappa"]  # the same in both
-
-
-def test_measurements_name_departures_that_there_are() -> None:
-    """Nothing is said to measure a setting that the shipped agent does not depart in."""
-    table = yaml.safe_load((ROOT / "results" / "measurements.yml").read_text())
-    everywhere = {name for task in load_results(ROOT / "results") for name in departures_of(task)}
-    for task, rows in table.items():
-        allowed = everywhere if task == "default" else set(departures_of(task))
-        assert not [(row, name) for row, names in rows.items() for name in names if name not in allowed]
-
-
-def test_rows_say_which_seeds_are_from_uncommitted_code(tmp_path: Path) -> None:
-    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
-    fake_run(tmp_path, "A", "tbc-hrl", 1, 1.0, commit="0123abcd+")
-    fake_run(tmp_path, "A", "tbc-hrl", 2, 1.0, config={"n_envs": 2})
-    resumed = fake_run(tmp_path, "A", "tbc-hrl", 3, 1.0).path / "versions.json"
-    resumed.write_text(json.dumps({"commit": "0123abcd", "resumed": [{"commit": "4567cdef+"}]}))
-    methods = load_results(tmp_path)["A"]
-    notes = notes_of_row(methods["tbc-hrl"], methods)
-    assert notes == [
-        "environments: 1 or 2, depending on the seed",
-        "seed 1, 3: code with changes that were not committed",
-    ]
-    resumed.write_text(json.dumps({"commit": "0123abcd", "resumed": ["4567cdef"]}))
-    with pytest.raises(ConfigError, match="resumed must hold named values"):
-        load_results(tmp_path)
 
 
 def test_tuning_seeds_are_left_out_or_named(tmp_path: Path) -> None:
@@ -344,82 +238,6 @@ def test_ablations_of_the_papers_settings_need_these(tmp_path: Path) -> None:
     fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
     fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4, "no-ts-paper")
     assert against_ablations(load_results(tmp_path)) == []
-
-
-def test_rows_of_a_plan_may_have_options_of_their_own(tmp_path: Path) -> None:
-    fake_run(tmp_path, "Pendulum", "tbc-hrl", 100, 1.0)
-    own = "first_seed: 102, options: [--n-eval-episodes, 20]"
-    rows = f"{{task: Pendulum, seeds: 1, {own}, methods: [tbc-hrl, tbc-hrl no-ts-paper]}}"
-    rows += ", {task: Drawbridge, seeds: 1, methods: [tbc-hrl]}"
-    plan = tmp_path / "campaign.yml"
-    plan.write_text(f"first_seed: 100\noptions: [--n-eval-episodes, 100]\nruns: [{rows}]")
-    commands = [row[3] for row in missing_table(tmp_path, load_results(tmp_path))[1:]]
-    planned = [job for command in commands for job in jobs(shlex.split(command)[3:])]
-    assert [job.seed for job in planned] == [102, 102, 100]
-    assert [job.n_episodes for job in planned] == [40 * 20 + 100, 40 * 20 + 100, 40 * 100 + 100]
-    assert [job.variant for job in planned] == ["full", "no-ts-paper", "full"]
-    assert {"--ablation", "no-ts", "--config", "paper"} <= set(planned[1].arguments)
-    plan.write_text(f"first_seed: 100\nruns: [{rows}, {{task: Pendulum, seeds: 1, methods: [hits]}}]")
-    with pytest.raises(ConfigError, match="all methods of a task must be evaluated alike"):
-        missing_table(tmp_path, load_results(tmp_path))
-
-
-def test_missing_runs_come_with_a_command_that_is_understood(tmp_path: Path) -> None:
-    counts = {"n_timesteps": 500, "eval_freq": 500, "n_eval_episodes": 100}
-    for seed in (0, 100):
-        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0, config=counts)
-    fake_run(tmp_path, "Pendulum", "hits", 100, 1.0, config=counts)
-    rows = "{task: Pendulum, seeds: 2, n_timesteps: 500, methods: [tbc-hrl, tbc-hrl no-ts, tbc-hrl full-paper]}"
-    rows += ", {task: Pendulum, seeds: 1, n_timesteps: 500, methods: [hits]}"
-    (tmp_path / "campaign.yml").write_text(f"first_seed: 100\noptions: [--n-eval-episodes, 100]\nruns: [{rows}]")
-    _, *missing = missing_table(tmp_path, load_results(tmp_path))
-    assert [row[:3] for row in missing] == [
-        ["Pendulum", "tbc-hrl", "1 of 2"],
-        ["Pendulum", "tbc-hrl no-ts", "0 of 2"],
-        ["Pendulum", "tbc-hrl full-paper", "0 of 2"],
-    ]
-    variants = []
-    for row in missing:
-        planned = list(jobs(shlex.split(row[3])[3:]))
-        assert [job.seed for job in planned] == [100, 101]
-        assert {job.n_timesteps for job in planned} == {500}
-        assert "--n-eval-episodes" in planned[0].arguments
-        variants.append(planned[0].target.path.parent.name)
-    assert variants == ["full", "no-ts", "full-paper"]
-    many = f"{{first_seed: 0, runs: [{{task: A, seeds: {10**30}, methods: [sac]}}]}}"
-    for wrong in ("runs: 3", "runs: [options]", many):
-        (tmp_path / "campaign.yml").write_text(wrong)
-        with pytest.raises(ConfigError, match="cannot read the plan"):
-            missing_table(tmp_path, load_results(tmp_path))
-
-
-def test_runs_made_otherwise_than_planned_do_not_count(tmp_path: Path) -> None:
-    planned = {"n_timesteps": 200_000, "eval_freq": 5000, "n_eval_episodes": 20}
-    changes: tuple[dict[str, int], ...] = ({}, {"n_timesteps": 100}, {"eval_freq": 100}, {"n_eval_episodes": 100})
-    for seed, change in enumerate(changes):
-        fake_run(tmp_path, "Pendulum", "tbc-hrl", seed, 1.0, config={**planned, **change})
-    plan = tmp_path / "campaign.yml"
-    plan.write_text("{first_seed: 0, runs: [{task: Pendulum, seeds: 4, methods: [tbc-hrl]}]}")
-    assert missing_table(tmp_path, load_results(tmp_path))[1][2] == "1 of 4"
-    assert planned["eval_freq"] == default_eval_freq(200_000) == eval_freq_of(200_000)
-    assert default_eval_freq(30) == eval_freq_of(30)
-    assert train.N_EVAL_EPISODES == N_EVAL_EPISODES
-
-
-def test_plans_that_evaluate_a_task_at_other_steps_are_refused(tmp_path: Path) -> None:
-    fake_run(tmp_path, "Pendulum", "tbc-hrl", 0, 1.0)
-    plan = tmp_path / "campaign.yml"
-    rows = (
-        "{task: Pendulum, seeds: 1, methods: [tbc-hrl]}, {task: Pendulum, seeds: 1, n_timesteps: 400, methods: [hac]}"
-    )
-    plan.write_text(f"{{first_seed: 0, runs: [{rows}]}}")
-    with pytest.raises(ConfigError, match="evaluated every 5000 steps with tbc-hrl and every 500 with hac"):
-        missing_table(tmp_path, load_results(tmp_path))
-    plan.write_text(f"{{first_seed: 0, options: [--eval-freq, 500], runs: [{rows}]}}")
-    assert [row[2] for row in missing_table(tmp_path, load_results(tmp_path))[1:]] == ["0 of 1", "0 of 1"]
-    plan.write_text(f"{{first_seed: 0, options: [--eval-freq], runs: [{rows}]}}")
-    with pytest.raises(ConfigError, match="cannot read the plan"):
-        missing_table(tmp_path, load_results(tmp_path))
 
 
 def test_no_extreme_is_lost_between_seeds_of_other_steps() -> None:
