@@ -24,7 +24,7 @@ SUBJECTS = {
         ["sb3_tbc/report/claims.py", "sb3_tbc/report/comparisons.py", "sb3_tbc/report/conditions.py",
          "sb3_tbc/report/departures.py", "sb3_tbc/report/planned.py", "sb3_tbc/report/runs.py",
          "sb3_tbc/report/tables.py"],
-        ["tests/report"],
+        [f"tests/report/test_{name}.py" for name in ("conditions", "departures", "planned", "tables")],
     ),
     "hindsight": (["sb3_tbc/smdp/hindsight.py"], ["tests/smdp/test_hindsight.py"]),
     "buffers": (["sb3_tbc/replay/buffers.py"], ["tests/replay/test_buffers.py", "tests/tbc_hrl/test_reachability.py"]),
