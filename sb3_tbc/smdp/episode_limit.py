@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import time
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, NamedTuple, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
@@ -288,11 +288,11 @@ def reset_checked(workers: SubprocVecEnv, shapes: Shapes) -> VecEnvObs:
     for remote, seed, options in zip(workers.remotes, workers._seeds, workers._options, strict=True):
         remote.send(("reset", (seed, options)))
     results = [remote.recv() for remote in workers.remotes]
-    checked = [_checked(observation, info, shapes) for observation, info in results]
-    workers.reset_infos = [info for _, info in checked]
+    told = [checked(observation, info, shapes) for observation, info in results]
+    workers.reset_infos = [info for _, info in told]
     workers._reset_seeds()
     workers._reset_options()
-    return _stacked([observation for observation, _ in checked], workers)  # type: ignore[misc]
+    return _stacked([observation for observation, _ in told], workers)
 
 
 def receive_checked(workers: SubprocVecEnv, shapes: Shapes) -> VecEnvStepReturn:
@@ -302,11 +302,11 @@ def receive_checked(workers: SubprocVecEnv, shapes: Shapes) -> VecEnvStepReturn:
     observations, rewards, dones, infos, reset_infos = (list(column) for column in zip(*results, strict=True))
     for index, done in enumerate(dones):
         if not done:
-            observations[index], infos[index] = _checked(observations[index], infos[index], shapes)
+            observations[index], infos[index] = checked(observations[index], infos[index], shapes)
             continue
-        last, infos[index] = _checked(infos[index]["terminal_observation"], infos[index], shapes)
+        last, infos[index] = checked(infos[index]["terminal_observation"], infos[index], shapes)
         infos[index]["terminal_observation"] = last
-        observations[index], reset_infos[index] = _checked(observations[index], reset_infos[index], shapes)
+        observations[index], reset_infos[index] = checked(observations[index], reset_infos[index], shapes)
     workers.reset_infos = reset_infos
     return _stacked(observations, workers), np.stack(rewards), np.stack(dones), infos
 
@@ -315,10 +315,14 @@ Shapes = list[tuple[str, tuple[int, ...] | None]]
 """Names of the parts of an observation with their shapes."""
 
 
-def _checked(observation: VecEnvObs, info: Plain, shapes: Shapes) -> tuple[VecEnvObs, Plain]:
+def checked(observation: VecEnvObs, info: Plain, shapes: Shapes) -> tuple[Arrays, Plain]:
+    """What an environment shows, or zeros and an ``info`` that says which shape is wrong.
+
+    :param shapes: names of its parts with their shapes
+    """
     wrong = wrong_shape(observation, shapes)
     if wrong is None:
-        return observation, info
+        return cast(Arrays, observation), info
     return {key: np.zeros(shape or ()) for key, shape in shapes}, {BAD_STEP: wrong}
 
 

@@ -14,7 +14,15 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, FloatArray
 from sb3_tbc.errors import EnvironmentFault, NonFiniteError
-from sb3_tbc.smdp.episode_limit import ANNOUNCE, BAD_STEP, CopyableVecEnvWrapper, LastWindow, with_episode_limit
+from sb3_tbc.smdp.episode_limit import (
+    ANNOUNCE,
+    BAD_STEP,
+    CopyableVecEnvWrapper,
+    LastWindow,
+    checked,
+    shapes_of,
+    with_episode_limit,
+)
 from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.finite import not_finite
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
@@ -73,6 +81,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         self.rng = np.random.default_rng(seed)
         self.clock = OptionClock(venv.num_envs, policy.views.subgoals, policy.rules)
         self._membrane = policy.actor.blank(venv.num_envs)
+        self._shapes = shapes_of(venv.observation_space)  # env_method brings what worker processes have not checked
         self._seen: dict[str, FloatArray] = {}
         self._actions: FloatArray = np.zeros((venv.num_envs, 0))
 
@@ -145,6 +154,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         if self.clock.used[index] >= self.policy.rules.max_options:
             self._announce_end(index)
         observation, reward, terminated, truncated, info = self.venv.env_method("step", action, indices=[index])[0]
+        observation, info = checked(observation, info, self._shapes)
         for key in GOAL_KEYS:
             self._seen[key][index] = observation[key]
         self._refuse_bad(index, float(reward), info)
@@ -191,7 +201,8 @@ class OptionEnv(CopyableVecEnvWrapper):
     def _restart(self, index: int, info: Plain) -> None:
         last = {key: self._seen[key][[index]] for key in GOAL_KEYS}
         info["terminal_observation"] = self.policy.views.high(last)[0]
-        observation, self.reset_infos[index] = self.venv.env_method("reset", indices=[index])[0]
+        observation, told = self.venv.env_method("reset", indices=[index])[0]
+        observation, self.reset_infos[index] = checked(observation, told, self._shapes)
         refuse_reset(index, observation, self.reset_infos[index])
         for key in GOAL_KEYS:
             self._seen[key][index] = observation[key]

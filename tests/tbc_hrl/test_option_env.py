@@ -169,9 +169,48 @@ def test_nothing_wrong_gets_through(agent: TBCHRL, missing: bool, words: str) ->
     env = OptionEnv(DummyVecEnv([Bad]), agent)
     env.venv.set_attr("missing", missing)
     env.envs[0].unwrapped.missing = missing
+    env.seed(3)  # a goal that the first three steps do not reach
     env.reset()
     with pytest.raises((NonFiniteError, EnvironmentFault), match=f"environment 0, step 3 of its option: .*{words}"):
         env.step(np.array([[0.0, 1.0]]))
+
+
+class Wider(Corridor):
+    """Its third step, or its second reset, shows a goal of two numbers, which would fit by broadcasting."""
+
+    at_reset = False
+
+    def step(self, action: Any) -> Any:
+        observation, *rest = super().step(action)
+        if self.steps == 3 and not self.at_reset:
+            observation["achieved_goal"] = observation["achieved_goal"].reshape(1, 1)
+        return observation, *rest
+
+    def reset(self, **kwargs: Any) -> Any:
+        observation, info = super().reset(**kwargs)
+        if self.at_reset and self.episode > 1:
+            observation["achieved_goal"] = observation["achieved_goal"].reshape(1, 1)
+        return observation, info
+
+
+class WiderLater(Wider):
+    at_reset = True
+
+
+@pytest.mark.parametrize(
+    ("task", "when"),
+    [(Wider, "environment 0, step 3 of its option"), (WiderLater, "environment 0, reset")],
+    ids=["step", "reset"],
+)
+def test_worker_processes_hand_on_nothing_of_another_shape(agent: TBCHRL, task: type[Corridor], when: str) -> None:
+    env = OptionEnv(SubprocVecEnv([task, task]), agent)
+    env.seed(3)
+    try:
+        env.reset()
+        with pytest.raises(EnvironmentFault, match=rf"{when}: .*must have shape \(1,\).*got shape \(1, 1\)"):
+            act(env)
+    finally:
+        env.close()
 
 
 class BadReset(Corridor):
