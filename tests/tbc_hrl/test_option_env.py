@@ -176,7 +176,7 @@ def test_nothing_wrong_gets_through(agent: TBCHRL, missing: bool, words: str) ->
 
 
 class Wider(Corridor):
-    """Its third step, or its second reset, shows a goal of two numbers, which would fit by broadcasting."""
+    """Its third step, or its second reset, shows a goal of shape (1, 1), which would fit by broadcasting."""
 
     at_reset = False
 
