@@ -40,7 +40,7 @@ RECIPES = {
         "them. Every unit matters: clamping one of the most active neurons ends nearly all success.",
     ),
     "Drawbridge": Recipe(
-        200_000,
+        400_000,
         "Nothing in this task is random: all episodes are the same, so success shows one learnt manoeuvre and its "
         "interval says nothing about other starts. A bridge of another speed is no part of training.",
     ),
