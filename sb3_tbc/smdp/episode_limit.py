@@ -376,11 +376,10 @@ def with_episode_limit(venv: VecEnv) -> VecEnv:
     return venv
 
 
-def can_tell(venv: VecEnv, subgoals: SubgoalSpace) -> bool:
+def can_tell(venv: VecEnv) -> bool:
     """Whether the limit sees what the agent sees, so that it can tell that a subgoal is reached or an event happened.
 
     :param venv: what the agent acts in, with :func:`with_episode_limit`
-    :param subgoals: the agent's
     """
     base = venv
     while isinstance(base, VecEnvWrapper) and not isinstance(base, LimitingVecEnv):
@@ -388,7 +387,7 @@ def can_tell(venv: VecEnv, subgoals: SubgoalSpace) -> bool:
     if isinstance(base, LimitingVecEnv):
         return bool(base.observation_space == venv.observation_space)
     same = all(space == venv.observation_space for space in venv.get_attr("task_space"))
-    return same and (isinstance(base, DummyVecEnv) or subgoals.is_data)
+    return same and not any(venv.env_is_wrapped(gym.ObservationWrapper))  # such a wrapper may keep the space
 
 
 def _put_limit(env: Env, index: int) -> Env:

@@ -105,12 +105,13 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
         self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
         ends_early = rules.ends_when_reached or views.subgoals.event is not None
-        self._task_can_tell = ends_early and can_tell(venv, views.subgoals)
+        self._task_can_tell = ends_early and can_tell(venv)
         self.judge = EpisodeJudge(venv)
         self.guard = Guard(venv, on_bad_step)
         self._started = False
         self._last_step: dict[int, int] = {}  # of a window that is its episode's last, by environment
         self._may_end: set[int] = set()  # environments that know the subgoal of that window
+        self._held: dict[int, Arrays] = {}  # what a last window led to of which the task hears a step late
         self._given: AnyArray = np.zeros(0)  # what step_async was given
 
     def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
@@ -133,6 +134,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         :return: what the low level sees
         """
         self._recorder.steps[:] = 0
+        self._held.clear()
         self.guard.begin(observation)
         self._begin_episodes(self._everywhere, observation)
         self._begin_options(self._everywhere, observation)
@@ -156,6 +158,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
             if owner == "clock":
                 getattr(self.clock, name)[:] = array
         self._announce(self._everywhere)
+        self._hold(self.clock.ended(observation) & (self.clock.elapsed > 0) & self._last_option, observation)
         self.guard.go_on(observation)
         self._started = True
         return self._low_observation(observation)
@@ -202,6 +205,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         )
         observation, task_rewards, dones, infos, seen, bad = self.guard.step(actions, self._recorder.steps)
         taken = ~bad  # a bad step did not happen: what it led to is not known
+        if self._held:
+            taken &= ~self._take_back(task_rewards, infos, seen)
         self._recorder.after_step(task_rewards, seen, taken)
         self.clock.tick(taken)
         over = self._windows_over(seen, dones)
@@ -220,19 +225,41 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         """Which windows end with this step, ``(n_envs,)``.
 
         The last window of an episode was announced to the task, which ends the episode with it. Where wrappers change
-        what the task sees, this may be a step late; the window then lasts that step longer.
+        what the task sees, this may be a step late; that step is then taken back.
         """
         if self.gives_up is not None:
             self.clock.give_up(self.gives_up(seen, self.clock))
         over = self.clock.ended(seen) | dones
         if not np.count_nonzero(over):
             return over
-        late = over & ~dones & (self.clock.used >= self.rules.max_options)
+        late = over & ~dones & self._last_option
         if np.count_nonzero(late):
-            for index in np.flatnonzero(late):
-                self._last_step[int(index)] = 0
+            self._hold(late, seen)
             over &= ~late
         return over
+
+    @property
+    def _last_option(self) -> BoolArray:
+        """Whose running option is the last of its episode, ``(n_envs,)``."""
+        return np.asarray(self.clock.used >= self.rules.max_options)
+
+    def _hold(self, late: BoolArray, seen: GoalObservation) -> None:
+        """Keep what last windows led to, and have their episodes ended with the next step."""
+        for index in map(int, np.flatnonzero(late)):
+            self._last_step[index] = 0
+            self._held[index] = {key: np.array(part[index]) for key, part in seen.items()}
+
+    def _take_back(self, rewards: FloatArray, infos: list[Plain], seen: GoalObservation) -> BoolArray:
+        """Undo the steps, in place, by which tasks heard that their last window was over; in which environments."""
+        extra = np.zeros(self.num_envs, dtype=bool)
+        for index, last in self._held.items():
+            extra[index], rewards[index] = True, 0.0
+            for key, part in last.items():
+                seen[key][index] = part
+            infos[index] |= {"terminal_observation": last, "TimeLimit.truncated": True, BUDGET_EXHAUSTED: True}
+            infos[index]["is_success"] = False  # what was reached in that step is too late
+        self._held.clear()
+        return extra
 
     def _close_options(self, where: Indices, seen: GoalObservation, dones: BoolArray, infos: list[Plain]) -> FloatArray:
         """Record the options that end; the low level's reward of each."""
@@ -262,7 +289,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         return episodes
 
     def _finish_episode(self, index: int, info: Plain) -> Episode:
-        truncated, exhausted = info.get("TimeLimit.truncated", False), info.get(BUDGET_EXHAUSTED, False)
+        truncated = info.get("TimeLimit.truncated", False)
+        exhausted = truncated and info.get(BUDGET_EXHAUSTED, False)  # a wrapper may end it with success in that step
         success = info["is_success"] = self.judge.succeeded(info)
         return self._recorder.finish(index, not truncated, success and not exhausted, bool(exhausted))
 

@@ -121,12 +121,14 @@ class SubgoalSpace:
     def __reduce__(self) -> tuple[object, ...]:
         """Travel to other processes whatever the maps are: functions without a name of their own go by value."""
         try:
-            pickle.dumps((self._achieved, self._local))
+            by_name = b"__main__" not in pickle.dumps((self._achieved, self._local))  # another process has its own main
         except (pickle.PicklingError, AttributeError, TypeError):
-            import cloudpickle  # one of SB3's dependencies, for what pickle cannot do
+            by_name = False
+        if by_name:
+            return _restored, (type(self), vars(self))
+        import cloudpickle  # one of SB3's dependencies, for what pickle cannot do
 
-            return _from_bytes, (type(self), cloudpickle.dumps(vars(self)))
-        return _restored, (type(self), vars(self))
+        return _from_bytes, (type(self), cloudpickle.dumps(vars(self)))
 
     def __deepcopy__(self, memo: object) -> SubgoalSpace:
         """Nothing in a space ever changes, so that copies share what it holds."""
