@@ -118,6 +118,20 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def seed_number(text: str) -> int:
+    """A seed: a whole number from 0 to 2^32 - 1, as NumPy takes it.
+
+    :raises argparse.ArgumentTypeError: otherwise
+    """
+    try:
+        value = int(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number") from error
+    if not 0 <= value < 2**32:
+        raise argparse.ArgumentTypeError(f"{value} is not between 0 and {2**32 - 1}")
+    return value
+
+
 def positive_int(text: str) -> int:
     """A whole number above zero, ``1e5`` allowed.
 

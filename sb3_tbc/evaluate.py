@@ -9,7 +9,7 @@ from pathlib import Path
 import torch as th
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
+from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
@@ -19,7 +19,7 @@ from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, algorithm_of, environment_of, load_model, observation_size, read_zip
 from sb3_tbc.zoo.environments import NAMESPACE, make_env, resolve_env
 from sb3_tbc.zoo.ledger import summarise, to_json
-from sb3_tbc.zoo.runner import evaluation_envs
+from sb3_tbc.zoo.runner import HELD_OUT, evaluation_envs
 
 EXAMPLES = {
     "sb3_tbc.evaluate runs/Pendulum/tbc-hrl/full/seed_0/model.zip": "100 episodes, and a summary of them",
@@ -36,7 +36,8 @@ def build_parser() -> Parser:
                         "it; pretrained:TASK is one that comes with the package")  # fmt: skip
     parser.add_argument("--env", help="task or goal environment id; by default the one the agent was trained on")
     parser.add_argument("--n-episodes", type=positive_int, default=100, help="episodes to count")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes")
+    parser.add_argument("--seed", type=seed_number, default=HELD_OUT, help="seed of the episodes; by default one that "
+                        "no training and none of its evaluations has used")  # fmt: skip
     parser.add_argument("--stochastic", action="store_true", help="sample actions as in training, instead of the means")
     parser.add_argument("--json", metavar="OUT", help="write the figures as JSON to this file and to standard output, "
                         "the summary to standard error; with - to standard output only")  # fmt: skip

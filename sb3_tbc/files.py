@@ -7,6 +7,7 @@ import errno
 import hashlib
 import io
 import os
+import secrets
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -73,6 +74,11 @@ def _reason(error: OSError) -> str:
     return f"{reason}; is the folder yours and writable?"
 
 
+def temporary_beside(path: Path) -> Path:
+    """A name for the file that is to replace ``path``, which no other thread, process or machine uses."""
+    return path.with_name(f".tmp{os.getpid()}{secrets.token_hex(4)}-{path.name}")
+
+
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside ``path``; the file written there replaces ``path`` if the block ends without error.
@@ -83,7 +89,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     with explained(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
+        temporary = temporary_beside(path)
         try:
             yield temporary
             sync(temporary)

@@ -18,7 +18,7 @@ from sb3_tbc.campaign.executors import Executor, LocalExecutor, RayExecutor, Slu
 from sb3_tbc.campaign.hours import plan, read_speeds
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
-from sb3_tbc.commands import FAILED, INTERRUPTED, Parser, positive_int, run_command, stop_like_ctrl_c
+from sb3_tbc.commands import FAILED, INTERRUPTED, Parser, positive_int, run_command, seed_number, stop_like_ctrl_c
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
 from sb3_tbc.train import N_EVAL_EPISODES, build_spec, default_eval_freq, variant_name
@@ -46,7 +46,7 @@ def build_parser() -> Parser:
     add("--tasks", nargs="+", default=sorted(task_names()), help="by default all of them")
     add("--algos", nargs="+", default=sorted(ALGORITHMS), help="by default all of them: hac, hits, sac, tbc-hrl")
     add("--seeds", type=positive_int, default=10, help="seeds of each task and method; the paper has 10")
-    add("--first-seed", type=int, default=0, help="the first seed; the others are the numbers that follow it")
+    add("--first-seed", type=seed_number, default=0, help="the first seed; the others are the numbers that follow it")
     add(
         "--config",
         choices=CONFIGS,

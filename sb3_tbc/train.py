@@ -13,7 +13,7 @@ from typing import Any
 import torch as th
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import INTERRUPTED, Parser, add_trust, positive_int, run_command
+from sb3_tbc.commands import INTERRUPTED, Parser, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
@@ -50,7 +50,7 @@ def build_parser() -> Parser:
                       "and configuration files take, and stop")  # fmt: skip
     what.add_argument("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
     what.add_argument("--env", default="Pendulum", help="a task's name or the id of any registered goal environment")
-    what.add_argument("--seed", type=int, default=0, help="seed of everything random in the run")
+    what.add_argument("--seed", type=seed_number, default=0, help="seed of everything random in the run")
     what.add_argument("--n-timesteps", type=positive_int, help="environment steps; by default the task's, see --list")
     what.add_argument("--n-envs", type=positive_int, help="environments side by side; by default the configuration's")
     what.add_argument("--config", metavar="{paper,tuned,FILE.yml}", help="paper: the values of the paper's tables; "

@@ -23,6 +23,7 @@ from sb3_tbc.settings import Settings
 from sb3_tbc.settings.listing import entries
 from sb3_tbc.tbc_hrl.config import FlatConfig, TBCConfig
 from sb3_tbc.tune import command as tune
+from sb3_tbc.zoo.runner import evaluation_seed, final_seed
 
 RIDDLES = (
     "in so many",
@@ -199,3 +200,41 @@ def test_require_gives_the_module_and_names_real_extras() -> None:
     named = {extra for source in sources for extra in re.findall(r"require\(.*?extra=\"(\w+)\"", source.read_text())}
     assert named
     assert named <= set(parser["options.extras_require"])
+
+
+def test_seeds_are_those_that_environments_take(capsys: pytest.CaptureFixture[str]) -> None:
+    seeds = [
+        (name, option)
+        for name, parser in parsers().items()
+        for action in parser._actions
+        for option in action.option_strings
+        if option.endswith("seed")
+    ]
+    assert len(seeds) > 6
+    for name, option in seeds:
+        for value in ("-1", str(2**32), "x"):
+            with pytest.raises(SystemExit) as stopped:
+                parsers()[name].parse_args([option, value])
+            assert stopped.value.code == 2
+            said = capsys.readouterr().err
+            assert f"argument {option}: " in said
+            assert "whole number" in said or "is not between 0 and 4294967295" in said
+
+
+@pytest.mark.parametrize("command", ["interpret", "export"])
+def test_another_tasks_environment_is_refused_in_one_line(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    more = ["--format", "numpy", "--output", str(tmp_path / "p.py"), "--check", "5"] if command == "export" else []
+    main = import_module(COMMANDS[command].module).main
+    assert main(["pretrained:Pendulum", "--env", "UR5Reacher", *more]) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "agent and environment do not fit: the agent's observation_space is" in said
+
+
+def test_evaluations_by_hand_repeat_no_training_episode() -> None:
+    """Neither where episodes of training begin, nor those of its evaluations."""
+    seed = evaluate.build_parser().parse_args(["pretrained:Pendulum"]).seed
+    taken = [first(run) for run in range(1000) for first in (evaluation_seed, final_seed)] + list(range(1000))
+    assert min(abs(seed - other) for other in taken) > 1_000_000

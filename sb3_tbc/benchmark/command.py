@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
+from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
@@ -86,7 +86,7 @@ def _add_robustness(commands: Commands) -> None:
     robustness.add_argument("models", nargs="+", type=model_path, metavar="MODEL.zip", help="agents of one task, shown "
                             "side by side; pretrained:TASK is one that comes with the package")  # fmt: skip
     robustness.add_argument("--n-episodes", type=positive_int, default=100, help="episodes under each disturbance")
-    robustness.add_argument("--seed", type=int, default=0, help="seed of the episodes")
+    robustness.add_argument("--seed", type=seed_number, default=0, help="seed of the episodes")
     robustness.add_argument("--json", metavar="OUT", help=JSON_HELP)
     add_trust(robustness)
 

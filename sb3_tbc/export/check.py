@@ -23,7 +23,7 @@ from sb3_tbc.extras import require
 from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.tbc_hrl import TBCHRL
-from sb3_tbc.zoo.environments import make_env
+from sb3_tbc.zoo.environments import make_env, refuse_other_spaces
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
 CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=c99")
@@ -226,10 +226,12 @@ def check(
     :param steps: environment steps; episodes follow one another
     :param seed: seed of the first episode
     :return: text to print: the comparison, also of a circuit's closed form, and the time of a step in C
+    :raises ConfigError: if the environment is none that the agent can act in
     """
     env = make_env(info["env_id"], **(info.get("env_kwargs") or {}))
     exported = player(kind, path, policy)
     try:
+        refuse_other_spaces(model, env)
         lines = [str(compare(model, exported, env, steps, seed))]
         if isinstance(policy.low, Circuit) and isinstance(exported, CPlayer | NumpyPlayer):
             lines.append(str(compare_closed_form(model, exported, env, steps, seed)))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
+from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.export.policy import MLP, Circuit, ExportedPolicy, extract
 from sb3_tbc.extras import require
 from sb3_tbc.files import save_atomic, write_atomic
@@ -33,7 +33,7 @@ def build_parser() -> Parser:
     parser.add_argument("--check", type=positive_int, metavar="STEPS", help="act for this many steps with the agent "
                         "and with the exported policy, and print how much their actions differ")  # fmt: skip
     parser.add_argument("--env", help="environment for --check; by default the task on which the agent was trained")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes of --check")
+    parser.add_argument("--seed", type=seed_number, default=0, help="seed of the episodes of --check")
     add_trust(parser)
     return parser
 

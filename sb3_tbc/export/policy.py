@@ -271,14 +271,20 @@ def _foreign_actor(algorithm: BaseAlgorithm) -> _MLPActor:
     :raises ConfigError: if it is of another kind
     """
     from sb3_contrib.tqc.policies import Actor as TQCActor
+    from stable_baselines3.common.torch_layers import FlattenExtractor
     from stable_baselines3.sac.policies import Actor as SACActor
 
     actor = getattr(algorithm.policy, "actor", None)
-    if isinstance(actor, SACActor | TQCActor) and not actor.use_sde:
-        return cast(_MLPActor, actor)
-    raise ConfigError(
-        f"the policy of {type(algorithm).__name__} cannot be exported as a high level; SAC's and TQC's can"
-    )
+    if not isinstance(actor, SACActor | TQCActor) or actor.use_sde:
+        raise ConfigError(
+            f"the policy of {type(algorithm).__name__} cannot be exported as a high level; SAC's and TQC's can"
+        )
+    if type(actor.features_extractor) is not FlattenExtractor:
+        raise ConfigError(
+            f"a high level behind {type(actor.features_extractor).__name__} cannot be exported; train it without "
+            "features_extractor_class"
+        )
+    return cast(_MLPActor, actor)
 
 
 def _read_mlp(actor: _MLPActor) -> MLP:

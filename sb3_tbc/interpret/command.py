@@ -10,12 +10,12 @@ from pathlib import Path
 import torch as th
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import Parser, add_trust, positive_int, run_command
+from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.evaluate import identify
 from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.interpret.drawing import picture_of
-from sb3_tbc.interpret.episodes import FIRST_SEED, HeldOutEpisodes
+from sb3_tbc.interpret.episodes import HeldOutEpisodes
 from sb3_tbc.interpret.features import space_of
 from sb3_tbc.interpret.findings import Effort, Findings, investigate, to_plain
 from sb3_tbc.interpret.page import live_page
@@ -26,6 +26,7 @@ from sb3_tbc.pretrained import model_path
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.algorithms import load_two_levels
 from sb3_tbc.zoo.ledger import to_json
+from sb3_tbc.zoo.runner import HELD_OUT
 
 EXAMPLES = {
     "sb3_tbc.interpret pretrained:Pendulum": "all measures, on 20 held-out episodes",
@@ -44,7 +45,7 @@ def build_parser() -> Parser:
                         "pretrained:TASK")  # fmt: skip
     parser.add_argument("--env", help="task or goal environment id; by default the one the agent was trained on")
     parser.add_argument("--n-episodes", type=positive_int, default=20, help="held-out episodes")
-    parser.add_argument("--seed", type=int, default=FIRST_SEED, help="seed of the first episode")
+    parser.add_argument("--seed", type=seed_number, default=HELD_OUT, help="seed of the first episode")
     parser.add_argument("--json", type=Path, metavar="OUT.json", help="write every figure")
     parser.add_argument("--png", type=Path, metavar="OUT.png", help="draw activation in space, as the paper's figure 5")
     parser.add_argument("--wiring", type=Path, metavar="OUT.png", help="draw the circuit: its readout, dead ends, and "

@@ -17,10 +17,9 @@ from sb3_tbc.smdp.options import Episode
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
-from sb3_tbc.zoo.environments import make_env
+from sb3_tbc.zoo.environments import make_env, refuse_other_spaces
+from sb3_tbc.zoo.runner import HELD_OUT
 
-FIRST_SEED = 50_000_000
-"""Seed of the first held-out episode; the seeds of training and evaluations are far below it."""
 MAX_SIDE_BY_SIDE = 160
 """Number of environments that step together: acting costs about the same for one as for many."""
 
@@ -70,9 +69,10 @@ class HeldOutEpisodes:
     :param env_kwargs: arguments of the environment
     :param n_episodes: how many
     :param seed: episode i starts from ``seed + i``
+    :raises ConfigError: when they begin, if the environment is none that the agent can act in
     """
 
-    def __init__(self, model: TBCHRL, env_id: str, env_kwargs: Plain, n_episodes: int, seed: int = FIRST_SEED) -> None:
+    def __init__(self, model: TBCHRL, env_id: str, env_kwargs: Plain, n_episodes: int, seed: int = HELD_OUT) -> None:
         self.model, self.n_episodes, self.seed = model, n_episodes, seed
         self.make_env = partial(make_env, env_id, **env_kwargs)
         self._venvs: dict[int, _SeededVecEnv] = {}
@@ -99,6 +99,7 @@ class HeldOutEpisodes:
     def _run(self, units: Units, lesions: Sequence[Lesion], which: Sequence[int]) -> list[Trace]:
         if len(which) not in self._venvs:
             self._venvs[len(which)] = _SeededVecEnv([self.make_env] * len(which))
+            refuse_other_spaces(self.model, self._venvs[len(which)])
         venv = self._venvs[len(which)]
         venv.start_from([self.seed + i for i in which])
         return run_once(self.model, units, venv, stack(lesions))

@@ -22,7 +22,7 @@ from sb3_tbc.aliases import Plain, PlainMapping, Space
 from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.ndbc.extractor import input_scale_of
-from sb3_tbc.recurrent.cells import make_cell
+from sb3_tbc.recurrent.cells import NDBCCell, make_cell
 from sb3_tbc.recurrent.sequences import SequenceReplayBuffer, Sequences, flat, flat_space
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
@@ -311,6 +311,14 @@ class NDBCSAC(PlainAlgorithm, SAC):
         replay_buffer.note_starts(self._last_episode_starts)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self._last_episode_starts = np.asarray(dones, dtype=bool)
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Update, see SB3; circuits with an adaptive step then look at their weights."""
+        super().train(gradient_steps, batch_size)
+        for network in (self.actor, self.critic, self.critic_target):
+            cell = network.features_extractor.cell
+            if isinstance(cell, NDBCCell):
+                cell.net.after_update(gradient_steps)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_state"]

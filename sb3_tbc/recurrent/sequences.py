@@ -126,8 +126,8 @@ class SequenceReplayBuffer(ReplayBuffer):
             kept[:, -1] = True
         actions = self.actions[rows, envs]
         before = np.where(starts[..., None], 0.0, self.actions[rows - 1, envs])
-        seen = self._normalize_obs(self.observations[rows, envs], env)
-        then = self._normalize_obs(self.next_observations[rows, envs][kept], env)
+        seen = self._normalized(self.observations[rows, envs], env)
+        then = self._normalized(self.next_observations[rows, envs][kept], env)
         dones = (self.dones * (1 - self.timeouts))[rows, envs][kept]
         rewards = self._normalize_reward(self.rewards[rows, envs][kept].reshape(-1, 1), env)
         inputs, begun, learnt = (th.as_tensor(x, device=self.device) for x in (_joined(seen, before), starts, kept))
@@ -139,6 +139,13 @@ class SequenceReplayBuffer(ReplayBuffer):
             dones=self.to_torch(dones.reshape(-1, 1)),
             rewards=self.to_torch(rewards.astype(np.float32)),
         )
+
+    def _normalized(self, rows: AnyArray, env: VecNormalize | None) -> AnyArray:
+        """Flat observations ``(..., width)`` by the statistics that ``env`` keeps in the observations' own shape."""
+        if env is None:
+            return rows
+        given: Any = self._normalize_obs(rows.reshape(*rows.shape[:-1], *(self.given_space.shape or ())), env)
+        return np.asarray(given.reshape(rows.shape))
 
     def _drawn(self, n: int) -> tuple[AnyArray, AnyArray]:
         """Rows ``(n, time)`` and environments ``(n, 1)`` of sequences that do not run across the newest row."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from stable_baselines3.common.env_util import is_wrapped
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
@@ -80,9 +81,10 @@ class GoalVecEnv(DummyVecEnv):
         infos: list[Plain] = []
         for index, env in enumerate(self.envs):
             action, step = self.actions[index], len(self.running[index].actions) + 1
+            kept = np.array(action)  # the task may change the other in place
             try:
                 observation, self.buf_rews[index], terminated, truncated, given = env.step(action)
-                self.running[index].actions.append(action)
+                self.running[index].actions.append(kept)
                 info = {**given, "TimeLimit.truncated": truncated and not terminated}
                 over = self.buf_dones[index] = terminated or truncated
                 if over:

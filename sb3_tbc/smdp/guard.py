@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
-from sb3_tbc.errors import EnvironmentFault, NonFiniteError
+from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError
 from sb3_tbc.smdp.episode_limit import BAD_STEP, RESETS, CopyableVecEnvWrapper
 from sb3_tbc.smdp.faults import reset_or_name, step_or_name
 from sb3_tbc.smdp.finite import all_finite, not_finite, place
@@ -48,9 +48,16 @@ class Guard:
 
     :param venv: the environments, with :func:`.with_episode_limit`, which looks at shapes
     :param on_bad_step: ``stop``: raise; ``end-episode``: end the episode with the step before, and reset
+    :raises ConfigError: for ``end-episode`` where wrappers of the vector change observations
     """
 
     def __init__(self, venv: VecEnv, on_bad_step: OnBadStep = "stop") -> None:
+        if on_bad_step == "end-episode" and venv.observation_space != venv.unwrapped.observation_space:
+            raise ConfigError(
+                "on_bad_step='end-episode' resets one environment alone, and the observations of that reset pass no "
+                "wrapper of the vector: use on_bad_step='stop', or wrap each environment in place of the vector "
+                "(gymnasium.wrappers.FrameStackObservation for VecFrameStack)"
+            )
         self.venv, self.on_bad_step = venv, on_bad_step
         self.count = 0
         self._none_bad = np.zeros(venv.num_envs, dtype=bool)

@@ -222,21 +222,28 @@ class SubgoalSpace:
         """Refuse an environment whose observations these maps do not read as they say.
 
         :param space: of goal observations
-        :raises ValueError: naming both sizes
+        :raises ValueError: naming both sizes; also where a map does not take batches
         """
         if not isinstance(space, spaces.Dict):
             return
-        blank = {key: np.zeros(part.shape or ()) for key, part in space.spaces.items()}
-        for name, found, wanted in (
-            ("achieved", self.achieved(blank), self.dim),
-            ("local", self.local(blank), self.local_dim),
-        ):
-            if np.shape(found) != (wanted,):
+        for name, size in (("achieved", self.dim), ("local", self.local_dim)):
+            if (found := self._shape_from(name, space)) != (size,):
                 raise ValueError(
-                    f"the subgoal space's {name} map gives {np.shape(found)} of an observation, its own size is "
-                    f"({wanted},): it was made for other observations. A wrapper that changes them (VecFrameStack) "
+                    f"the subgoal space's {name} map gives {found} of an observation, its own size is "
+                    f"({size},): it was made for other observations. A wrapper that changes them (VecFrameStack) "
                     "needs a subgoal space of its own, subgoals=SubgoalSpace(...)"
                 )
+            for n in (2, 3):
+                if (found := self._shape_from(name, space, n)) != (n, size):
+                    raise ValueError(
+                        f"the subgoal space's {name} map gives {found} of {n} observations at once, ({n}, {size}) is "
+                        "due: let it take batches, observation['observation'][..., a:b] in place of [a:b]"
+                    )
+
+    def _shape_from(self, name: str, space: spaces.Dict, *batch: int) -> tuple[int, ...]:
+        """Shape of what a map gives of an observation, or of a batch of them."""
+        blank = {key: np.zeros((*batch, *(part.shape or ()))) for key, part in space.spaces.items()}
+        return np.shape(getattr(self, name)(blank))
 
     def achieved(self, observation: GoalObservation) -> FloatArray:
         """Subgoal-space point of a goal observation, ``(..., subgoal_dim)``, task units."""

@@ -64,7 +64,7 @@ def make_views(config: TBCConfig, subgoals: SubgoalSpace, achieved_in_observatio
 
 
 def make_high_reward(config: TBCConfig, rules: OptionRules) -> HighLevelReward:
-    """What the high level is rewarded for; a time budget that nobody chooses costs nothing."""
+    """What the high level is rewarded for; time budgets that are all the same cost nothing."""
     return HighLevelReward(
         target=config.target,
         gamma=config.high.gamma,

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tbc.aliases import Env
@@ -13,6 +14,7 @@ from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.guard import GuardedVecEnv
 from sb3_tbc.smdp.options import Episode
+from sb3_tbc.tbc_hrl.calls import refuse_vec_normalize
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
@@ -69,7 +71,10 @@ def evaluate_flat(
     deterministic: bool = True,
 ) -> EvaluationResult:
     """As :func:`evaluate_hierarchical`, for an agent without subgoals: these figures are NaN, decisions are 0."""
-    venv: VecEnv = GuardedVecEnv(with_episode_limit(_vector(env, n_eval_episodes)), model.on_bad_step)
+    given = _vector(env, n_eval_episodes)
+    refuse_vec_normalize(given)
+    check_for_correct_spaces(given, model.observation_space, model.action_space)
+    venv: VecEnv = GuardedVecEnv(with_episode_limit(given), model.on_bad_step)
     if seed is not None:
         venv.seed(seed)
     observation = venv.reset()
@@ -103,9 +108,11 @@ def evaluate_hierarchical(
     :param n_eval_episodes: episodes to run
     :param seed: seeds the environments (environment i gets ``seed + i``), for episode-by-episode comparisons
     :param deterministic: use the means of both levels (and the averaged actors)
-    :raises ValueError: if ``n_eval_episodes`` is not positive
+    :raises ValueError: if ``n_eval_episodes`` is not positive, or the environment is none that the agent can act in
     """
     venv = _vector(env, n_eval_episodes)
+    refuse_vec_normalize(venv)
+    check_for_correct_spaces(venv, model.observation_space, model.action_space)
     runner = TwoLevelRunner(
         venv, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule, deterministic,
         model.config.on_bad_step,

@@ -60,7 +60,7 @@ def put_together(high: BaseAlgorithm, low: Agent) -> Agent:
 
     :param low: a :class:`~sb3_tbc.tbc_hrl.tbc_hrl.TBCHRL`
     :raises ValueError: if the algorithm's observations or actions are not those of the agent's high level, or were
-        normalised; or that high level ends windows before their time
+        normalised; if it has a memory; or if that high level ends windows before their time
     """
     if not isinstance(low, TwoLevelSaving):
         raise ValueError(f"low must be a TBCHRL, whose low level executes the options, got {type(low).__name__}")
@@ -76,6 +76,11 @@ def put_together(high: BaseAlgorithm, low: Agent) -> Agent:
         raise ValueError(
             f"high must observe {wanted[0].shape} and act {wanted[1].shape}, got {given[0].shape} and "
             f"{given[1].shape}: train it in OptionEnv(venv, agent) with this agent"
+        )
+    if high.predict(np.zeros((1, *wanted[0].shape), np.float32), deterministic=True)[1] is not None:
+        raise ValueError(
+            f"{type(high).__name__} remembers, and an agent carries no memory of a high level from option to option: "
+            "use an algorithm whose predict needs no state"
         )
     agent = copy.copy(low)
     agent.policy = copy.copy(low.policy)

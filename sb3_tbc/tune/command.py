@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch as th
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command
+from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.outside import flat_name, folder_name
@@ -66,7 +66,7 @@ def build_parser() -> Parser:
     add("--workers", type=positive_int, default=1, help="processes on this machine")
     add("--storage", help="journal file (*.log) or any Optuna URL; by default <log-folder>/<study>/journal.log")
     add("--sampler", default="tpe", help="tpe, random, or another of optuna.samplers")
-    add("--sampler-seed", type=int, default=0, help="seed of the sampler")
+    add("--sampler-seed", type=seed_number, default=0, help="seed of the sampler")
     add("--pruner", default="median+wilcoxon", help="median, hyperband, halving, wilcoxon, none, or two joined by +")
     add(
         "--minutes",
@@ -79,7 +79,11 @@ def build_parser() -> Parser:
     add("--log-folder", type=Path, default=Path("runs/tune"), help="runs go to <folder>/<study>/trial_<n>/seed_<s>")
     add("--device", default="cpu", help="torch device")
     add("--trial", metavar="best|N", help="do not search: train on this trial's settings with --seed")
-    add("--seed", type=int, help="with --trial: seed of the training; by default the first after those of the search")
+    add(
+        "--seed",
+        type=seed_number,
+        help="with --trial: seed of the training; by default the first after those of the search",
+    )
     add("--overwrite", action="store_true", help="with --trial: replace an earlier run of that trial and seed")
     same = parser.add_argument_group(
         "what all trials share", "fixed when a study begins; not needed when it is continued"
@@ -88,7 +92,7 @@ def build_parser() -> Parser:
     add("--n-seeds", type=positive_int, help="training runs per trial, one per seed (default: 2)")
     add(
         "--first-seed",
-        type=int,
+        type=seed_number,
         help="seed of a trial's first run; the next runs have the following seeds (default: 0)",
     )
     add("--objective", choices=list(OBJECTIVES), help="what makes a trial good (default: auc). "

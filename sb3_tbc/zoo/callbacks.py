@@ -125,6 +125,7 @@ class SuccessEvalCallback(EventCallback):
         self.best_model_path = best_model_path
         self.callback_on_new_best = callback_on_new_best
         self.rows = read_evaluations(csv_path) if csv_path else []
+        self._last = self.rows[-1].timesteps if self.rows else 0
         episodes = csv_path.with_suffix(".npz") if csv_path else None
         self.episodes = EvaluationEpisodes(episodes, {row.timesteps for row in self.rows})
         self._earlier = wall_time
@@ -142,10 +143,13 @@ class SuccessEvalCallback(EventCallback):
         """Seconds since the run began, evaluations included, earlier parts of a resumed run too."""
         return self._earlier + time.monotonic() - self._started
 
+    def _on_training_start(self) -> None:
+        self._last = min(self._last, self.model.num_timesteps)  # another call of learn may count from zero again
+
     def _on_step(self) -> bool:
-        done = self.rows[-1].timesteps if self.rows else 0
-        if self.num_timesteps // self.eval_freq <= done // self.eval_freq:
+        if self.num_timesteps // self.eval_freq <= self._last // self.eval_freq:
             return True
+        self._last = self.num_timesteps
         self.evaluate()
         return self._on_event()
 

@@ -9,11 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
+from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.goal_spaces import goal_space_problems
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly
@@ -155,6 +157,19 @@ def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: An
     env = described = DescribedGoalEnv(env, description=_DESCRIPTIONS.get(made_alike), **(subgoals or {}))
     _DESCRIPTIONS[made_alike] = described.description
     return env
+
+
+def refuse_other_spaces(model: BaseAlgorithm, env: Env | VecEnv) -> None:
+    """Refuse an environment in which an agent cannot act.
+
+    :raises ConfigError: if its observations or actions are not those of the agent's own
+    """
+    for name, own in (("observation_space", model.observation_space), ("action_space", model.action_space)):
+        if getattr(env, name) != own:
+            raise ConfigError(
+                f"agent and environment do not fit: the agent's {name} is {one_line(own, 200)}, the environment's "
+                f"{one_line(getattr(env, name), 200)}; --env names another one"
+            )
 
 
 def check_goal_env(env: Env, env_id: str) -> None:

@@ -34,6 +34,9 @@ from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise
 from sb3_tbc.zoo.rows import RowsCallback
 from sb3_tbc.zoo.safety import CURE, ConsistentState, DivergenceCallback, check_weights
 
+HELD_OUT = 50_000_000
+"""First seed of episodes that no run has met, neither in training nor in its evaluations."""
+
 
 def evaluation_seed(seed: int) -> int:
     """First seed of the evaluations during training.

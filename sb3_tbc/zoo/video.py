@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
+from sb3_tbc.files import temporary_beside
 from sb3_tbc.tasks.probe import said_success
 from sb3_tbc.tasks.rendering import Overlay, with_caption
 from sb3_tbc.tbc_hrl import TBCHRL
@@ -117,7 +118,7 @@ def record_video(model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: 
         raise ConfigError(f"a video's name must end in .mp4, got {path}")
     imageio = require("imageio.v2", extra="video", what="a film")
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".tmp{os.getpid()}-{path.name}")
+    temporary = temporary_beside(path)
     fps = frames_per_second(env)
     try:
         writer: _Writer

@@ -235,6 +235,42 @@ def test_normalised_observations_are_normalised_when_replayed() -> None:
         make(env=VecNormalize(DummyVecEnv([lambda: AsDict(Recall())]))).learn(10)
 
 
+class Square(gym.ObservationWrapper[Any, Any, Any]):
+    """The same as a matrix."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.observation_space = spaces.Box(-1.0, 1.0, (2, 1), np.float32)
+
+    def observation(self, observation: Any) -> Any:
+        return observation.reshape(2, 1)
+
+
+def test_matrices_are_normalised_as_vectors_are() -> None:
+    samples = []
+    for wrapper in (None, Square):
+        env = VecNormalize(make_vec_env(Recall, 2, seed=0, wrapper_class=wrapper))
+        model = make(env=env).learn(60)
+        np.random.seed(0)  # noqa: NPY002, as the buffer draws
+        samples.append(model.replay_buffer.sample(8, env=env).observations.inputs)  # type: ignore[union-attr, attr-defined]
+    th.testing.assert_close(samples[0], samples[1])
+
+
+def test_an_adaptive_step_follows_the_weights(tmp_path: Path) -> None:
+    circuit = {**SMALL, "synapses": "paper", "time_constants": None, "initial_gains": (1.0, 1.1)}
+    circuit["adaptive_step"] = {"refresh_every": 5, "eta": 20.0}
+    model = make("ndbc", policy_kwargs={"net_arch": [16], "cell": "ndbc", "hidden_size": 8, "cell_kwargs": circuit})
+    net = model.actor.features_extractor.cell.net
+    before = net.sub_steps
+    with th.no_grad():
+        net.cell.raw_conductance.add_(100.0)  # as long training might
+    model.learn(20)
+    assert net.updates == model._n_updates == 10
+    assert net.sub_steps > before
+    model.save(tmp_path / "agent.zip")
+    assert NDBCSAC.load(tmp_path / "agent.zip").actor.features_extractor.cell.net.sub_steps == net.sub_steps
+
+
 def test_the_replay_buffer_is_saved_as_plain_arrays(tmp_path: Path) -> None:
     model = make(buffer_size=30).learn(40)
     model.save_replay_buffer(tmp_path / "replay.npz")

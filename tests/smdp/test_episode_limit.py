@@ -112,6 +112,82 @@ def test_all_kinds_of_vectors_give_the_same_episodes() -> None:
     assert any(reached for _, reached in lengths[0])  # the last window of some episode ended early
 
 
+class Kept(gym.ObservationWrapper):
+    """A wrapper of observations that keeps their space, and here the observations, too."""
+
+    def observation(self, observation: Any) -> Any:
+        return {key: np.array(part) for key, part in observation.items()}
+
+
+class Halved(gym.ObservationWrapper):
+    """What the task sees is not what the agent sees, although the spaces are the same."""
+
+    def observation(self, observation: Any) -> Any:
+        return {**observation, "achieved_goal": 0.5 * observation["achieved_goal"]}
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_step_in_which_the_task_hears_late_of_the_end_is_taken_back(there: bool) -> None:
+    kind = partial(SubprocVecEnv, start_method="fork") if there else DummyVecEnv
+    told = []
+    for env in (far, lambda: Kept(far())):
+        venv = kind([env] * 2)
+        venv.seed(3)
+        episodes, infos = episodes_of(hierarchical(venv, window_end="reached"), 40)
+        venv.close()
+        assert all(e.budget_exhausted and not e.success and not e.terminated for e in episodes)
+        assert all(not i["is_success"] and i["TimeLimit.truncated"] for i in infos)
+        assert all(
+            i["terminal_observation"]["observation"][1] == e.length for e, i in zip(episodes, infos, strict=True)
+        )
+        told.append([(e.length, e.options[-1].reached) for e in episodes])
+    n = min(map(len, told))
+    assert told[0][:3] == told[1][:3]  # later ones have had an action less
+    assert n > 5
+    assert any(reached for _, reached in told[1])
+
+
+def test_what_a_wrapper_of_observations_shows_ends_the_last_window() -> None:
+    episodes, _ = episodes_of(hierarchical(DummyVecEnv([lambda: Halved(far())] * 2), window_end="reached"), 200)
+    last = [(episode, episode.options[-1]) for episode in episodes]
+    assert any(option.reached and option.duration < option.time_budget for _, option in last)
+    for episode, option in last:
+        seen = episode.achieved_goal[option.start + 1 : episode.length + 1, 0]
+        there = np.flatnonzero(np.abs(seen - option.subgoal[0]) < 0.05)
+        assert option.reached == (len(there) > 0)
+        if len(there):
+            assert option.duration == there[0] + 1
+
+
+class EndsAtItsGoal(gym.Wrapper):
+    """Ends episodes that the task itself would go on with."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, _, truncated, info = self.env.step(action)
+        return observation, reward, info["is_success"], truncated, info
+
+
+class GoesOn(Corridor):
+    """A corridor that does not end at its goal, and in which all actions lead to it in its sixth step."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, _ = super().step(np.ones(1))
+        return observation, reward, False, truncated, {"is_success": terminated}
+
+
+@pytest.mark.parametrize("venv", [DummyVecEnv, partial(SubprocVecEnv, start_method="fork")], ids=["here", "there"])
+def test_success_in_the_last_step_of_the_last_window_counts(venv: Any) -> None:
+    env = hierarchical(venv([lambda: EndsAtItsGoal(GoesOn(30, goal=0.6))]), dt_max=2.0, dt_min=1.5)
+    episodes, infos = episodes_of(env, 20)
+    env.close()
+    assert [episode.length for episode in episodes] == [6, 6, 6]
+    for episode, info in zip(episodes, infos, strict=True):
+        assert episode.success
+        assert episode.terminated
+        assert not episode.budget_exhausted
+        assert info["is_success"]
+
+
 def test_the_monitors_file_holds_every_episode(tmp_path: Any) -> None:
     there = partial(SubprocVecEnv, start_method="fork")
     kinds = {"here": (GoalVecEnv, monitored), "there": (there, monitored), "beneath": (there, wrapped)}

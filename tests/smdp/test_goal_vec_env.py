@@ -47,3 +47,20 @@ def test_what_it_returns_is_the_callers():
     infos[0]["mine"] = True
     assert "mine" not in venv.step(np.ones((1, 1), np.float32))[3][0]
     assert set(seen) == {"observation", "achieved_goal", "desired_goal"}
+
+
+class ChangesItsAction(Corridor):
+    """A careless task."""
+
+    def step(self, action):
+        action *= 0.5
+        return super().step(action)
+
+
+def test_actions_are_kept_as_they_were_given():
+    venv = GoalVecEnv([lambda: ChangesItsAction(goal=0.9)])
+    venv.seed(0)
+    venv.reset()
+    for _ in range(3):
+        seen = venv.step(np.ones((1, 1), np.float32))[0]
+    np.testing.assert_equal(venv.relive([episode._replace() for episode in venv.running]), seen)

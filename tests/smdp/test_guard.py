@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.smdp.guard import Guard
@@ -34,6 +35,13 @@ def test_what_was_seen_is_the_step_before_and_not_the_reset() -> None:
     assert step.seen["achieved_goal"][0, 0] == pytest.approx(0.1)
     assert step.infos[0]["terminal_observation"]["achieved_goal"][0] == pytest.approx(0.1)
     assert step.observation["achieved_goal"][0, 0] == 0.0
+
+
+def test_frames_that_are_stacked_around_a_vector_cannot_begin_again() -> None:
+    stacked = VecFrameStack(GoalVecEnv([Corridor]), 3)
+    Guard(with_episode_limit(stacked))
+    with pytest.raises(ConfigError, match="on_bad_step='end-episode' resets one environment alone"):
+        Guard(with_episode_limit(stacked), "end-episode")
 
 
 def two_monitored() -> list:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
+from gymnasium import spaces
 
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
@@ -31,3 +33,31 @@ def test_each_coordinate_has_the_threshold_of_its_group(
 def test_a_group_may_not_be_empty() -> None:
     with pytest.raises(ValueError, match=r"groups must use each of the 2 coordinates once, got \(\(\), \(0, 1\)\)"):
         make([[], [0, 1]], [0.1, 0.1])
+
+
+def box(*shape: int) -> spaces.Box:
+    return spaces.Box(-np.inf, np.inf, shape, np.float64)
+
+
+def test_maps_take_batches() -> None:
+    space = spaces.Dict({"observation": box(4), "achieved_goal": box(2), "desired_goal": box(2)})
+    for dim in (1, 2, 3):
+
+        def first(observation: Any, dim: int = dim) -> Any:
+            return observation["observation"][:dim]
+
+        def last_axis(observation: Any, dim: int = dim) -> Any:
+            return observation["observation"][..., :dim]
+
+        for achieved in (first, last_axis):
+            names = ["x", "y", "z"][:dim]
+            made = SubgoalSpace(
+                [-1] * dim, [1] * dim, [0.1] * dim, achieved, lambda o: o["observation"], np.ones(4), names
+            )
+            if achieved is last_axis:
+                made.check_fits(space)
+                continue
+            with pytest.raises(
+                ValueError, match=rf"achieved map gives .* of \d observations at once, \(\d, {dim}\) is due"
+            ):
+                made.check_fits(space)

@@ -6,9 +6,11 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from corridor import Corridor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent, evaluate_flat, evaluate_hierarchical
@@ -110,3 +112,12 @@ def test_predict_asks_for_no_budget_below_the_shortest(monkeypatch: pytest.Monke
     monkeypatch.setattr(model.actor, "propose", lambda seen, *_: np.tile([0.0, -1.0], (len(seen), 1)))
     _, state = model.predict(Corridor().reset(seed=0)[0], deterministic=True)
     assert TwoLevelState(*state).time_budget.tolist() == [4.0]
+
+
+@pytest.mark.parametrize("flat", [False, True])
+def test_environments_that_the_agent_was_not_made_for_are_refused(flat: bool) -> None:
+    model = FlatSAC("MultiInputPolicy", Corridor(), buffer_size=100, seed=0) if flat else make()
+    with pytest.raises(ValueError, match="VecNormalize moves the subgoal space"):
+        evaluate_agent(model, VecNormalize(DummyVecEnv([Corridor])), 1)
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        evaluate_agent(model, gym.make("sb3_tbc/Pendulum-v0"), 1)

@@ -10,14 +10,17 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from gymnasium.spaces import Box
-from sb3_contrib import TQC, CrossQ
+from sb3_contrib import TQC, CrossQ, RecurrentPPO
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor, VecNormalize
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError
 from sb3_tbc.export.policy import extract
+from sb3_tbc.smdp.hindsight import HindsightSettings, high_level_steps
+from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.option_env import OptionEnv
 
@@ -130,6 +133,50 @@ def test_any_algorithm_is_the_high_level(agent: TBCHRL, algorithm: Any) -> None:
     else:
         with pytest.raises(ConfigError, match="cannot be exported as a high level"):
             extract(together, "corridor")
+
+
+class Halving(BaseFeaturesExtractor):
+    """Networks behind it see half of everything."""
+
+    def __init__(self, space: Any) -> None:
+        super().__init__(space, space.shape[0])
+
+    def forward(self, seen: Any) -> Any:
+        return seen / 2
+
+
+def test_a_high_level_behind_an_extractor_is_not_exported(agent: TBCHRL) -> None:
+    policy = {**SMALL["policy_kwargs"], "features_extractor_class": Halving}  # type: ignore[dict-item]
+    high = SAC("MlpPolicy", options(agent), policy_kwargs=policy, seed=0)
+    with pytest.raises(ConfigError, match="a high level behind Halving cannot be exported"):
+        extract(TBCHRL.from_levels(high, agent), "corridor")
+
+
+@pytest.mark.parametrize("duration", ["joint", "rule", "fixed"])
+def test_it_pays_what_the_agent_learns_from(duration: str) -> None:
+    """The agent's own transitions of an episode, without hindsight, beside the rewards of the same options here."""
+    settings: dict[str, Any] = {"max_options": 5, "duration": duration, "duration_cost": 2.0, "testing_fraction": 0.0}
+    agent = TBCHRL("MultiInputPolicy", Corridor(), compile=False, seed=0, **settings)
+    runner = TwoLevelRunner(
+        DummyVecEnv([lambda: Corridor(goal=0.99)]), agent.actor, agent.views, agent.rules, np.random.default_rng(0),
+        agent.schedule, deterministic=True,
+    )  # fmt: skip
+    runner.env.venv.seed(3)
+    runner.reset()
+    while not (episodes := runner.step().episodes):
+        pass
+    no_hindsight = HindsightSettings(0, "future", -10.0, True, tolerance=-1.0)
+    learnt = high_level_steps(
+        episodes[0], agent.subgoals, agent.rules, agent.high_reward, no_hindsight, runner.env.judge.goal_test,
+        agent.views.high, np.random.default_rng(0),
+    ).rewards  # fmt: skip
+    env = OptionEnv(DummyVecEnv([lambda: Corridor(goal=0.99)]), agent)
+    env.seed(3)
+    env.reset()
+    width = agent.views.high_action_space().shape[0]
+    paid = [env.step(option.unit_action[None, :width])[1][0] for option in episodes[0].options]
+    assert len(paid) == 5
+    np.testing.assert_allclose(learnt[:5], paid, rtol=1e-5)
 
 
 def test_levels_that_do_not_fit_are_refused(agent: TBCHRL) -> None:
@@ -250,6 +297,9 @@ def test_what_does_not_fit_is_refused(agent: TBCHRL) -> None:
     for venv, given in ((Corridor(), agent), (make_vec_env(Corridor, 1), high)):
         with pytest.raises(ValueError, match="needs a vector of environments and a TBCHRL"):
             OptionEnv(venv, given)  # type: ignore[arg-type]
+    remembering = RecurrentPPO("MlpLstmPolicy", options(agent), n_steps=8, batch_size=8)
+    with pytest.raises(ValueError, match="RecurrentPPO remembers"):
+        TBCHRL.from_levels(remembering, agent)
     other = make_vec_env(lambda: gym.wrappers.TransformAction(Corridor(), lambda a: a[:1], Box(-1, 1, (2,))), 1)
     with pytest.raises(ValueError, match="Action spaces do not match"):
         OptionEnv(other, agent)

@@ -94,6 +94,17 @@ def test_evaluates_on_time_and_keeps_the_best(agent: Agent, tmp_path: Path, monk
     assert best.read_text() == "agent at 21"
 
 
+def test_a_second_training_is_evaluated_too(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(callbacks, "evaluate_agent", evaluation([0.5] * 4, []))
+    callback = SuccessEvalCallback(None, 10, 4)  # type: ignore[arg-type]
+    callback.init_callback(agent)  # type: ignore[arg-type]
+    for _ in range(2):
+        agent.num_timesteps = 0
+        callback.on_training_start({}, {})
+        steps(callback, agent, 25)
+    assert [row.timesteps for row in callback.rows] == [10, 20, 10, 20]
+
+
 @pytest.mark.parametrize("rate", ["nan", "7.0", "-0.1"])
 def test_success_rates_that_are_none_are_refused(rate: str, tmp_path: Path) -> None:
     path = tmp_path / "evaluations.csv"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -163,3 +164,12 @@ def test_curve_summary() -> None:
         "worst_after_first_90": 0.8,
     }
     assert curve_summary([])["best_success_rate"] is None
+
+
+def test_two_writers_of_one_file_do_not_meet(tmp_path: Path) -> None:
+    """Each of two threads replaces the file many times; every reader finds what one of them wrote."""
+    path = tmp_path / "trials.csv"
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(lambda text: [write_atomic(path, text * 20_000) for _ in range(100)], "ab"))
+    assert path.read_text() in ("a" * 20_000, "b" * 20_000)
+    assert [p.name for p in tmp_path.iterdir()] == ["trials.csv"]
