@@ -102,7 +102,7 @@ def subgoal_space_of(env: Env, **given: Any) -> SubgoalSpace:
     :param env: a goal environment
     :param given: ``low``, ``high``, ``thresholds``, ... of :func:`describe_goal_env`, instead of the environment's own
     """
-    own = getattr(env.unwrapped, "subgoals", None)
+    own = env.get_wrapper_attr("subgoals") if env.has_wrapper_attr("subgoals") else None
     return own if isinstance(own, SubgoalSpace) and not given else describe_goal_env(env, **given).subgoals
 
 

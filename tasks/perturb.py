@@ -73,6 +73,11 @@ class Perturb(Wrapper):
         """The task's own spec: it holds ``perturb`` among its arguments."""
         return self.env.spec
 
+    @property
+    def bit_generators(self) -> list[np.random.BitGenerator]:
+        """Its own randomness, which an episode that is to be repeated needs beside the task's."""
+        return [self._rng.bit_generator]
+
     def reset(
         self, *, seed: int | None = None, options: Plain | None = None
     ) -> tuple[dict[str, NDArray[np.float64]], Plain]:

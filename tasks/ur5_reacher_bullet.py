@@ -141,6 +141,8 @@ class UR5ReacherBullet(ReplayedTask):
         self._pristine: int = bullet.saveState(physicsClientId=client)
 
     def _restart(self, state: dict[str, Array]) -> None:
+        if self._client < 0:  # closed in the meantime
+            self._new_world()
         start = np.array([self.np_random.uniform(-math.pi / 8, math.pi / 8), *START])
         self._record.clear()  # an episode begins from the world as it was built
         self._start([*state.get("qpos", start), *state.get("qvel", np.zeros(3))])

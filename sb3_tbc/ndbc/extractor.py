@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 from sb3_tbc.aliases import PlainMapping, Space
@@ -23,7 +24,7 @@ class NDBCExtractor(BaseFeaturesExtractor):
 
     Use it as ``policy_kwargs={"features_extractor_class": NDBCExtractor, "features_extractor_kwargs": {...}}``.
 
-    :param observation_space: a Box, or a Dict of Boxes, whose entries are joined in the order of their keys
+    :param observation_space: a Box, or a Dict of Boxes, whose entries are joined in the order of the space's keys
     :param features_dim: number of features
     :param wiring: the wiring's numbers, as :class:`NDBCWiring` takes them, without ``n_inputs``
     :param input_scale: fixed scales the joined observation is divided by; by default the largest finite bound of each
@@ -42,7 +43,8 @@ class NDBCExtractor(BaseFeaturesExtractor):
     ) -> None:
         super().__init__(observation_space, features_dim)
         is_dict = isinstance(observation_space, spaces.Dict)
-        parts = list(observation_space.spaces.values()) if is_dict else [observation_space]  # type: ignore[attr-defined]
+        self.keys = list(observation_space.spaces) if is_dict else []  # type: ignore[attr-defined]
+        parts = [observation_space[key] for key in self.keys] if is_dict else [observation_space]  # type: ignore[index]
         boxes = [part for part in parts if isinstance(part, spaces.Box)]
         if len(boxes) < len(parts):
             raise ValueError(f"NDBCExtractor takes a Box or a Dict of Boxes, got {observation_space}")
@@ -54,13 +56,18 @@ class NDBCExtractor(BaseFeaturesExtractor):
     def forward(self, observations: th.Tensor | dict[str, th.Tensor]) -> th.Tensor:
         """Features ``(batch, features_dim)``."""
         if isinstance(observations, dict):
-            observations = th.cat([part.flatten(1) for part in observations.values()], dim=1)
+            observations = th.cat([observations[key].flatten(1) for key in self.keys], dim=1)
         features: th.Tensor = self.net(observations.flatten(1))[0]
         return features
 
 
 def input_scale_of(box: spaces.Box) -> list[float]:
-    """What each number of an observation is divided by: its largest bound, or 1 where it has no sensible one."""
+    """What each number of an observation is divided by: its largest bound, or 1 where it has no sensible one.
+
+    Images are divided by 1, as SB3's policies have divided them by 255 already.
+    """
+    if is_image_space(box):
+        return [1.0] * int(np.prod(box.shape))
     bounds = np.maximum(np.abs(box.low), np.abs(box.high)).ravel()
     usable = np.isfinite(bounds) & (bounds > 0) & (bounds < 1e6)
     scale: list[float] = np.where(usable, bounds, 1.0).tolist()

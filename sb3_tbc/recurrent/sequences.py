@@ -178,11 +178,11 @@ class SequenceReplayBuffer(ReplayBuffer):
                 )
             getattr(self, name)[:rows] = found[name]
         # in a larger buffer, what was a full ring begins at its oldest row
-        self.full = rows == self.buffer_size and bool(found["full"])
+        self.full = rows == self.buffer_size
         if bool(found["full"]) and not self.full:
             for name in self.arrays:
                 getattr(self, name)[:rows] = np.roll(found[name], -int(found["pos"]), axis=0)
-        self.pos = int(found["pos"]) if self.full else rows % self.buffer_size
+        self.pos = int(found["pos"]) % self.buffer_size if self.full else rows
 
 
 def _joined(observations: Any, actions: AnyArray) -> Float32:

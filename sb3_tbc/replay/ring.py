@@ -117,8 +117,8 @@ class RingBuffer(BaseBuffer):
         rows = len(state[next(iter(self.data))])
         if rows > self.buffer_size:
             raise ValueError(f"saved replay buffer has {rows} rows, this one has room for {self.buffer_size}")
-        self.full = bool(state["full"]) and rows == self.buffer_size
-        self.pos = int(state["pos"]) if self.full else rows % self.buffer_size
+        self.full = rows == self.buffer_size  # what was not full may fill a smaller buffer
+        self.pos = int(state["pos"]) % self.buffer_size if self.full else rows
         # what was a full ring begins at its oldest row in a larger buffer, so that windows lie in one piece again
         oldest = int(state["pos"]) if state["full"] and not self.full else 0
         for name, array in self.data.items():

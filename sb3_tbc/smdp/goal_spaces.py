@@ -57,6 +57,13 @@ def check_goal_space(observation: Space, action: Space | None = None) -> spaces.
     return observation
 
 
+def goal_parts(space: Space) -> Space:
+    """What of an observation an agent with two levels sees; another space as it is."""
+    if not isinstance(space, spaces.Dict) or any(key not in space.spaces for key in GOAL_KEYS):
+        return space
+    return spaces.Dict({key: space[key] for key in GOAL_KEYS})
+
+
 def width(space: spaces.Dict, key: str) -> int:
     """Number of entries of a part of a goal observation."""
     return int(np.prod(space.spaces[key].shape or ()))

@@ -24,6 +24,7 @@ class RunningEpisode(NamedTuple):
     seed: int | None  # given to the reset; if None, the generator's state is used
     generator: Plain  # state of the task's random generator before the reset
     actions: list[AnyArray]  # taken since the reset
+    others: Sequence[Plain] = ()  # likewise, of generators that wrappers of ours have
 
 
 def in_goal_vec_env(env: Env | VecEnv) -> Env | VecEnv:
@@ -61,14 +62,18 @@ class GoalVecEnv(DummyVecEnv):
         return super().env_method(method_name, *args, indices=indices, **kwargs)
 
     def _note_start(self, index: int, seed: int | None) -> None:
-        generator = self.envs[index].unwrapped.np_random.bit_generator
-        self.running[index] = RunningEpisode(seed, dict(generator.state) if seed is None else {}, [])
+        env, states = self.envs[index], []
+        if seed is None:
+            states = [dict(generator.state) for generator in (env.unwrapped.np_random.bit_generator, *_others(env))]
+        self.running[index] = RunningEpisode(seed, states[0] if states else {}, [], states[1:])
 
     def relive(self, running: Sequence[RunningEpisode]) -> GoalObservation:
         """Begin the same episodes again, take the same actions, and return the observations they lead to."""
         for index, (env, episode) in enumerate(zip(self.envs, running, strict=True)):
             if episode.seed is None:
                 env.unwrapped.np_random.bit_generator.state = episode.generator
+                for generator, state in zip(_others(env), episode.others, strict=False):  # older runs have none
+                    generator.state = state
             observation, self.reset_infos[index] = env.reset(seed=episode.seed)
             for action in episode.actions:
                 observation = env.step(action)[0]
@@ -107,3 +112,8 @@ class GoalVecEnv(DummyVecEnv):
 
     def _obs_from_buf(self) -> GoalObservation:  # type: ignore[override]
         return {key: array.copy() for key, array in self.buf_obs.items()}
+
+
+def _others(env: Env) -> list[Any]:
+    """Bit generators that a wrapper has beside the task's own."""
+    return env.get_wrapper_attr("bit_generators") if env.has_wrapper_attr("bit_generators") else []

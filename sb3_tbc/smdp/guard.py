@@ -52,18 +52,22 @@ class Guard:
     """
 
     def __init__(self, venv: VecEnv, on_bad_step: OnBadStep = "stop") -> None:
-        if on_bad_step == "end-episode" and venv.observation_space != venv.unwrapped.observation_space:
+        self.venv, self.on_bad_step = venv, on_bad_step
+        if on_bad_step == "end-episode" and not self._can_begin_one():
             raise ConfigError(
                 "on_bad_step='end-episode' resets one environment alone, and the observations of that reset pass no "
                 "wrapper of the vector: use on_bad_step='stop', or wrap each environment in place of the vector "
                 "(gymnasium.wrappers.FrameStackObservation for VecFrameStack)"
             )
-        self.venv, self.on_bad_step = venv, on_bad_step
         self.count = 0
         self._none_bad = np.zeros(venv.num_envs, dtype=bool)
         self._in_a_row = np.zeros(venv.num_envs, dtype=np.int64)
         self._last: GoalObservation = {}
         self._resets: list[int | None] = [None] * venv.num_envs  # of each task, at the begin of its running episode
+
+    def _can_begin_one(self) -> bool:
+        """Whether one environment can be reset alone: what its reset shows passes no wrapper of the vector."""
+        return bool(self.venv.observation_space == self.venv.unwrapped.observation_space)
 
     def reset(self) -> GoalObservation:
         """Reset every environment.
@@ -154,6 +158,8 @@ class Guard:
                 continue
             if not elsewhere:
                 self._stop_or_count(index, step, told, seen, rewards)
+            elif not self._can_begin_one():
+                raise EnvironmentFault(f"{place(index, step)}: {what}")
             self._tell(f"{place(index, step)}: {what}")
             bad[index] = True
             rewards[index] = 0.0

@@ -12,6 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from sb3_tbc.aliases import Env
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.episode_limit import with_episode_limit
+from sb3_tbc.smdp.goal_spaces import goal_parts
 from sb3_tbc.smdp.guard import GuardedVecEnv
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.tbc_hrl.calls import refuse_vec_normalize
@@ -112,7 +113,9 @@ def evaluate_hierarchical(
     """
     venv = _vector(env, n_eval_episodes)
     refuse_vec_normalize(venv)
-    check_for_correct_spaces(venv, model.observation_space, model.action_space)
+    same = goal_parts(venv.observation_space) == goal_parts(model.observation_space)  # it sees nothing else
+    if not same or venv.action_space != model.action_space:
+        check_for_correct_spaces(venv, model.observation_space, model.action_space)
     runner = TwoLevelRunner(
         venv, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule, deterministic,
         model.config.on_bad_step,

@@ -108,7 +108,7 @@ class TBCPolicy(BasePolicy):
 
         :param deterministic: use the means of both levels, and the averaged actors where they are kept
         :return: actions in the environment's units, and the new state
-        :raises ValueError: if the observation is not that of a goal environment
+        :raises ValueError: if the observation is not that of a goal environment, or the state of other environments
         :raises NonFiniteError: if a level answers with NaN
         """
         batch, single = self._as_batch(observation)
@@ -134,6 +134,11 @@ class TBCPolicy(BasePolicy):
         if state is None:
             return clock, self.actor.blank(n)
         given = TwoLevelState(*state)
+        if len(given.elapsed) != n:
+            raise ValueError(
+                f"state is of {len(given.elapsed)} environments, the observation of {n}: pass the state that predict "
+                "gave for these environments, or None where episodes begin"
+            )
         for name in OptionClock.carried:
             getattr(clock, name)[:] = getattr(given, name)
         return clock, np.array(given.membrane, dtype=np.float32)

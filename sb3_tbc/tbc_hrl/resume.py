@@ -130,7 +130,10 @@ def _relive(collector: Collector, plain: PlainMapping, state: Mapping[str, AnyAr
 
 def _running(venv: GoalVecEnv) -> tuple[list[Plain], Arrays]:
     """How the running episodes began, and the actions taken since."""
-    starts = [{"seed": episode.seed, "generator": episode.generator} for episode in venv.running]
+    starts = [
+        {"seed": episode.seed, "generator": episode.generator, "others": list(episode.others)}
+        for episode in venv.running
+    ]
     return starts, {f"actions.{i}": np.array(episode.actions) for i, episode in enumerate(venv.running)}
 
 

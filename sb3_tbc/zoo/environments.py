@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.outside import one_line
-from sb3_tbc.smdp.goal_spaces import goal_space_problems
+from sb3_tbc.smdp.goal_spaces import goal_parts, goal_space_problems
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.tasks.foreign import ROBOTICS, home_of, import_quietly
 from sb3_tbc.tasks.generic import DescribedGoalEnv, GoalEnvDescription
@@ -149,7 +149,7 @@ def make_env(env_id: str, subgoals: PlainMapping | None = None, **env_kwargs: An
     except ConfigError:
         env.close()
         raise
-    if hasattr(env.unwrapped, "subgoals"):
+    if env.has_wrapper_attr("subgoals"):
         if subgoals:
             raise ConfigError(f"{env_id!r} defines its own subgoal space; leave out `subgoals`, got {dict(subgoals)}")
         return env
@@ -164,11 +164,12 @@ def refuse_other_spaces(model: BaseAlgorithm, env: Env | VecEnv) -> None:
 
     :raises ConfigError: if its observations or actions are not those of the agent's own
     """
-    for name, own in (("observation_space", model.observation_space), ("action_space", model.action_space)):
-        if getattr(env, name) != own:
+    for name in ("observation_space", "action_space"):
+        own, given = goal_parts(getattr(model, name)), goal_parts(getattr(env, name))
+        if given != own:
             raise ConfigError(
                 f"agent and environment do not fit: the agent's {name} is {one_line(own, 200)}, the environment's "
-                f"{one_line(getattr(env, name), 200)}; --env names another one"
+                f"{one_line(given, 200)}; --env names another one"
             )
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.preprocessing import preprocess_obs
 
 from sb3_tbc.ndbc.extractor import NDBCExtractor
 
@@ -38,3 +39,19 @@ def test_dict_observations_are_joined_and_scaled_by_their_bounds() -> None:
     th.testing.assert_close(extractor(parts), extractor.net(th.cat([parts["a"], parts["b"]], dim=1))[0])
     with pytest.raises(ValueError, match="Box"):
         NDBCExtractor(spaces.Discrete(3))
+
+
+def test_dict_observations_are_joined_in_the_order_of_the_space() -> None:
+    """Environments give their keys in any order, vectors of environments in that of the space."""
+    space = spaces.Dict({"b": spaces.Box(-1.0, 1.0, (3,)), "a": spaces.Box(-4.0, 2.0, (2,))})
+    extractor = NDBCExtractor(space, features_dim=5)
+    parts = {"b": th.randn(7, 3), "a": th.randn(7, 2)}
+    turned = {"a": parts["a"], "b": parts["b"]}
+    th.testing.assert_close(extractor(parts), extractor(turned), rtol=0, atol=0)
+
+
+def test_images_are_scaled_once() -> None:
+    space = spaces.Box(0, 255, (3, 6, 6), np.uint8)
+    extractor = NDBCExtractor(space, features_dim=5)
+    given = preprocess_obs(th.full((1, 3, 6, 6), 255), space)
+    assert float((given.flatten() * extractor.net.input_gain).max()) == 1.0  # type: ignore[union-attr]

@@ -271,6 +271,19 @@ def test_an_adaptive_step_follows_the_weights(tmp_path: Path) -> None:
     assert NDBCSAC.load(tmp_path / "agent.zip").actor.features_extractor.cell.net.sub_steps == net.sub_steps
 
 
+def test_replay_fills_a_buffer_of_just_its_size(tmp_path: Path) -> None:
+    made = make(buffer_size=100).learn(60)
+    made.save_replay_buffer(tmp_path / "replay.npz")
+    made.save(tmp_path / "agent.zip")
+    for size in (60, 61):
+        loaded = NDBCSAC.load(tmp_path / "agent.zip", env=Recall(), buffer_size=size)
+        loaded.load_replay_buffer(tmp_path / "replay.npz")
+        buffer, before = loaded.replay_buffer, made.replay_buffer
+        assert buffer is not None and before is not None  # noqa: PT018
+        assert buffer.size() == 60
+        assert_array_equal(buffer.observations[:60], before.observations[:60])
+
+
 def test_the_replay_buffer_is_saved_as_plain_arrays(tmp_path: Path) -> None:
     model = make(buffer_size=30).learn(40)
     model.save_replay_buffer(tmp_path / "replay.npz")

@@ -119,6 +119,15 @@ def test_buffer_state_round_trip_and_mismatch() -> None:
         low_buffer(3, 1).extend(low_level_steps(episode(), ENV.subgoals, RULES))
 
 
+def test_rows_that_just_fill_a_smaller_buffer_stay() -> None:
+    old, new = low_buffer(13, 3), low_buffer(5, 3)
+    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    assert steps.local.shape[0] == 5
+    old.extend(steps)
+    new.set_state(old.get_state())
+    assert (new.size(), new.full, new.pos) == (5, True, 0)
+
+
 @pytest.mark.parametrize("more", [0, 5])
 def test_a_full_ring_goes_on_in_a_larger_one(more: int) -> None:
     """Episodes are told apart by their serial number; what was sampled of a window belongs to it."""

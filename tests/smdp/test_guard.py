@@ -8,7 +8,7 @@ from corridor import Corridor
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, EnvironmentFault
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
 from sb3_tbc.smdp.guard import Guard
@@ -42,6 +42,15 @@ def test_frames_that_are_stacked_around_a_vector_cannot_begin_again() -> None:
     Guard(with_episode_limit(stacked))
     with pytest.raises(ConfigError, match="on_bad_step='end-episode' resets one environment alone"):
         Guard(with_episode_limit(stacked), "end-episode")
+
+
+def test_episodes_of_someone_else_in_stacked_frames_end_the_run_in_words() -> None:
+    stacked = with_episode_limit(VecFrameStack(GoalVecEnv([Corridor]), 3))
+    guard = Guard(stacked)
+    guard.reset()
+    stacked.reset()
+    with pytest.raises(EnvironmentFault, match="it was reset by someone else"):
+        guard.step(np.zeros((1, 1), np.float32), np.zeros(1, dtype=np.int64))
 
 
 def two_monitored() -> list:

@@ -113,3 +113,11 @@ def test_solve3():
     matrix, right = root @ root.T, rng.normal(size=3)
     expected = np.linalg.solve(matrix + 0.02 * np.eye(3), right)
     np.testing.assert_allclose(solve3(matrix.tolist(), 0.02, right.tolist()), expected, rtol=1e-10)
+
+
+def test_a_closed_arm_can_begin_again(bullet):
+    first = bullet.reset(seed=3)[0]
+    bullet.close()
+    again = bullet.reset(seed=3)[0]
+    np.testing.assert_array_equal(first["observation"], again["observation"])
+    bullet.step(bullet.action_space.sample())

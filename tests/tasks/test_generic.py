@@ -12,6 +12,8 @@ from points import Boxed, Dense, Point
 from sb3_tbc.tasks import TASKS
 from sb3_tbc.tasks.generic import DescribedGoalEnv, check_goal_env, describe_goal_env, subgoal_space_of
 
+from sb3_tbc.zoo.environments import make_env
+
 
 @pytest.mark.parametrize("task", TASKS)
 def test_our_own_tasks_lack_nothing(task):
@@ -22,6 +24,26 @@ def test_our_own_tasks_lack_nothing(task):
     restored = pickle.loads(pickle.dumps(subgoals))
     observation, _ = env.reset(seed=0)
     np.testing.assert_array_equal(restored.achieved(observation), subgoals.achieved(observation))
+
+
+class WithSubgoals(gym.Wrapper):
+    """A wrapper that says what may be asked for."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.subgoals = describe_goal_env(Point(), names=["mine_x", "mine_y"]).subgoals
+
+
+def test_a_wrappers_subgoals_count():
+    gym.register("WithSubgoals-v0", lambda **_: WithSubgoals(Point()), max_episode_steps=30)
+    try:
+        for env in (make_env("WithSubgoals-v0"), gym.make("WithSubgoals-v0")):
+            assert env.get_wrapper_attr("subgoals").names == ("mine_x", "mine_y")
+            assert subgoal_space_of(env).names == ("mine_x", "mine_y")
+    finally:
+        del gym.registry["WithSubgoals-v0"]
+    hidden = make("Pendulum", perturb={"hide_velocities": True})
+    assert subgoal_space_of(hidden) is hidden.get_wrapper_attr("subgoals")
 
 
 def test_check_names_every_problem():

@@ -10,9 +10,10 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from corridor import Corridor
+from gymnasium.spaces import Box, Dict
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_tbc import TBCHRL
+from sb3_tbc import TBCHRL, HiTS
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent, evaluate_flat, evaluate_hierarchical
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.policy import TwoLevelState
@@ -121,3 +122,31 @@ def test_environments_that_the_agent_was_not_made_for_are_refused(flat: bool) ->
         evaluate_agent(model, VecNormalize(DummyVecEnv([Corridor])), 1)
     with pytest.raises(ValueError, match="Observation spaces do not match"):
         evaluate_agent(model, gym.make("sb3_tbc/Pendulum-v0"), 1)
+
+
+class Filmed(Same):
+    """Shows a picture, too, which no level looks at."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.observation_space = Dict({**self.observation_space.spaces, "image": Box(0, 255, (40, 40, 3), np.uint8)})
+
+    def _observation(self) -> dict[str, Any]:
+        return {**super()._observation(), "image": np.zeros((40, 40, 3), np.uint8)}
+
+
+def test_what_the_agent_does_not_see_may_differ() -> None:
+    """SB3 turns the axes of pictures in the agent's own environments alone."""
+    model = TBCHRL("MultiInputPolicy", Filmed(), max_options=5, compile=False, seed=0)
+    filmed, plain = (evaluate_hierarchical(model, env, 3, seed=0) for env in (Filmed(), Same()))
+    np.testing.assert_array_equal(filmed.rewards, plain.rewards)
+
+
+def test_a_state_of_other_environments_is_refused() -> None:
+    model = HiTS("MultiInputPolicy", Corridor(), max_options=5, compile=False, seed=0)
+    seen = Corridor().reset(seed=0)[0]
+    three = {key: np.stack([part] * 3) for key, part in seen.items()}
+    for one, other, said in ((seen, three, "of 1 environments, the observation of 3"), (three, seen, "of 3 .* of 1")):
+        _, state = model.predict(one)
+        with pytest.raises(ValueError, match=f"state is {said}"):
+            model.predict(other, state)

@@ -65,13 +65,13 @@ def contents(model):
     return found
 
 
-def check(task, tmp_path, n_envs=1, after=700, until=1800, **settings):
+def check(task, tmp_path, n_envs=1, after=700, until=1800, env_kwargs=None, **settings):
     env_id = f"sb3_tbc/{task}-v0"
-    whole = make(task, make_envs(env_id, n_envs, 5), **settings)
+    whole = make(task, make_envs(env_id, n_envs, 5, env_kwargs), **settings)
     save = SaveOnce(tmp_path, after)
     whole.learn(until, callback=save)
     assert after <= save.saved_at < until
-    resumed = TBCHRL.load(tmp_path / "model.zip", env=make_envs(env_id, n_envs, 99))
+    resumed = TBCHRL.load(tmp_path / "model.zip", env=make_envs(env_id, n_envs, 99, env_kwargs))
     resumed.load_replay_buffer(tmp_path / "replay.npz")
     assert resumed.num_timesteps == save.saved_at
     th.manual_seed(123)
@@ -101,6 +101,12 @@ def test_with_running_episodes_and_memory(n_envs, window_end, tmp_path):
 
 def test_with_all_that_has_randomness_of_its_own(tmp_path):
     check("Pendulum", tmp_path, 2, 1500, 4000, duration_loss_coef=0.1, memory="window", sequence_length=3)
+
+
+def test_of_a_perturbed_task(tmp_path):
+    """Noise and physics come from a generator of the wrapper's own."""
+    perturb = {"observation_noise": 0.05, "dynamics_scale": {"mass": [0.8, 1.2]}, "action_delay": 1}
+    check("Pendulum", tmp_path, 2, 2500, 5000, {"perturb": perturb})
 
 
 def test_states_of_another_moment_are_left_alone(tmp_path, caplog):
