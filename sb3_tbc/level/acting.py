@@ -235,3 +235,59 @@ class FrozenActor:
     def is_stale(self) -> bool:
         """Whether the weights were changed by hand since they were read."""
         return self._version == self._policy.weights_version and self._weights.changed()
+
+
+class ActingLevel:
+    """A level's policy at work: all that acting needs of a level, without what it learns from.
+
+    :param policy: of the level
+    """
+
+    def __init__(self, policy: LevelPolicy) -> None:
+        self.policy = policy
+        self._frozen = {average: FrozenActor(policy, average) for average in (False, True)}
+
+    @property
+    def state_dim(self) -> int:
+        """Width of the actor's state, 0 for an MLP."""
+        return self.policy.actor.state_dim
+
+    def refresh(self) -> None:
+        """Make the next :meth:`act` read the weights again; needed after changing them by hand."""
+        self.policy.after_updates(0)
+
+    def notice_changes(self) -> None:
+        """Read the weights again if they were changed by hand since they were read."""
+        if any(frozen.is_stale() for frozen in self._frozen.values()):
+            self.refresh()
+
+    def act(
+        self,
+        observations: FloatArray,
+        states: FloatArray,
+        deterministic: bool | NDArray[np.bool_],
+        rng: np.random.Generator,
+        average: bool = False,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Act in NumPy from the current weights.
+
+        :param observations: ``(n, observation_dim)`` float32
+        :param states: ``(n, state_dim)`` float32, zeros at the start of a window
+        :param deterministic: the squashed mean instead of a sample, for all rows or for those of a mask ``(n,)``
+        :param rng: source of the noise
+        :param average: act from the averaged actor
+        :return: unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``
+        """
+        return self._frozen[average].act(observations, states, deterministic, rng)
+
+    def values(self, observations: FloatArray, unit_actions: FloatArray) -> FloatArray:
+        """The lowest of the critics' values of actions, ``(n,)``.
+
+        :param observations: ``(n, observation_dim)``
+        :param unit_actions: ``(n, action_dim)`` in [-1, 1]
+        """
+        with th.no_grad():
+            seen, actions = (
+                th.as_tensor(x, dtype=th.float32, device=self.policy.device) for x in (observations, unit_actions)
+            )
+            return np.asarray(th.cat(self.policy.critic(seen, actions), dim=1).min(dim=1).values.cpu().numpy())

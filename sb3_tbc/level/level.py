@@ -18,7 +18,7 @@ from torch import nn
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import HierarchyError, NonFiniteError
-from sb3_tbc.level.acting import FrozenActor
+from sb3_tbc.level.acting import ActingLevel
 from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.level.spaces_only import SpacesOnlyVecEnv
 from sb3_tbc.level.update import AVERAGE_DECAY, EXTREMES, SACUpdate
@@ -141,19 +141,14 @@ class SACLevel(SAC):
             actor_q=self.actor_q,
             earlier_steps=self.earlier_steps,
         )
-        self._frozen = {average: FrozenActor(self.policy, average) for average in (False, True)}
+        self.acting = ActingLevel(self.policy)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_update", "_frozen"]
+        return [*super()._excluded_save_params(), "_update", "acting"]
 
     def attach(self, replay_buffer: BurstBuffer) -> None:
         """Learn from this replay buffer from now on."""
         self.replay_buffer = replay_buffer  # type: ignore[assignment]
-
-    @property
-    def state_dim(self) -> int:
-        """Width of the actor's state, 0 for an MLP."""
-        return self.policy.actor.state_dim
 
     @property
     def compiled(self) -> bool:
@@ -246,14 +241,14 @@ class SACLevel(SAC):
             f" {self._n_updates}; a lower learning rate or rewards of smaller scale usually cure it"
         )
 
-    def refresh(self) -> None:
-        """Make the next :meth:`act` read the weights again; needed after changing them by hand."""
-        self.policy.after_updates(0)
+    @property
+    def state_dim(self) -> int:
+        """Width of the actor's state, 0 for an MLP."""
+        return self.acting.state_dim
 
-    def notice_changes(self) -> None:
-        """Read the weights again if they were changed by hand since they were read."""
-        if any(frozen.is_stale() for frozen in self._frozen.values()):
-            self.refresh()
+    def refresh(self) -> None:
+        """See :meth:`.ActingLevel.refresh`."""
+        self.acting.refresh()
 
     def act(
         self,
@@ -263,25 +258,5 @@ class SACLevel(SAC):
         rng: np.random.Generator,
         average: bool = False,
     ) -> tuple[FloatArray, FloatArray]:
-        """Act in NumPy from the current weights.
-
-        :param observations: ``(n, observation_dim)`` float32
-        :param states: ``(n, state_dim)`` float32, zeros at the start of a window
-        :param deterministic: the squashed mean instead of a sample, for all rows or for those of a mask ``(n,)``
-        :param rng: source of the noise
-        :param average: act from the averaged actor
-        :return: unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``
-        """
-        return self._frozen[average].act(observations, states, deterministic, rng)
-
-    def values(self, observations: FloatArray, unit_actions: FloatArray) -> FloatArray:
-        """The lowest of the critics' values of actions, ``(n,)``.
-
-        :param observations: ``(n, observation_dim)``
-        :param unit_actions: ``(n, action_dim)`` in [-1, 1]
-        """
-        with th.no_grad():
-            seen, actions = (
-                th.as_tensor(x, dtype=th.float32, device=self.device) for x in (observations, unit_actions)
-            )
-            return np.asarray(th.cat(self.policy.critic(seen, actions), dim=1).min(dim=1).values.cpu().numpy())
+        """See :meth:`.ActingLevel.act`."""
+        return self.acting.act(observations, states, deterministic, rng, average)

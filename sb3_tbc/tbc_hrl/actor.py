@@ -7,7 +7,7 @@ from typing import NoReturn
 import numpy as np
 
 from sb3_tbc.arrays import BoolArray, FloatArray
-from sb3_tbc.level.level import SACLevel
+from sb3_tbc.level.acting import ActingLevel
 from sb3_tbc.tbc_hrl.reconsideration import Reconsideration
 
 
@@ -24,7 +24,7 @@ class TwoLevelActor:
     """
 
     def __init__(
-        self, high: SACLevel, low: SACLevel, memory: str, reconsideration: Reconsideration | None = None
+        self, high: ActingLevel, low: ActingLevel, memory: str, reconsideration: Reconsideration | None = None
     ) -> None:
         self.high, self.low, self.memory, self.reconsideration = high, low, memory, reconsideration
 

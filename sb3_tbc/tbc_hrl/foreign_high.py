@@ -84,6 +84,6 @@ def put_together(high: BaseAlgorithm, low: Agent) -> Agent:
         )
     agent = copy.copy(low)
     agent.policy = copy.copy(low.policy)
-    agent.policy.actor = TwoLevelActor(ForeignHigh(high), low.low, low.policy.memory)  # type: ignore[arg-type]
+    agent.policy.actor = TwoLevelActor(ForeignHigh(high), low.low.acting, low.policy.memory)  # type: ignore[arg-type]
     agent.foreign_high = high
     return agent

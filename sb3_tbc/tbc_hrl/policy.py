@@ -66,8 +66,10 @@ class TBCPolicy(BasePolicy):
     ) -> None:
         super().__init__(observation_space, action_space, squash_output=True)
         self.high_policy, self.low_policy = high.policy, low.policy
-        reconsideration = Reconsideration(high, views, rules, reconsider_margin) if rules.may_be_reconsidered else None
-        self.actor = TwoLevelActor(high, low, memory, reconsideration)
+        levels = high.acting, low.acting  # and not the levels themselves, with all that they learn from
+        reconsider = rules.may_be_reconsidered
+        reconsideration = Reconsideration(levels[0], views, rules, reconsider_margin) if reconsider else None
+        self.actor = TwoLevelActor(*levels, memory, reconsideration)
         self.views, self.rules, self.memory, self.schedule = views, rules, memory, schedule
         self.unit = UnitActions(action_space)
         self.rng = np.random.default_rng(seed)

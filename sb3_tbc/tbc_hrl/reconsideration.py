@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sb3_tbc.arrays import BoolArray
-from sb3_tbc.level.level import SACLevel
+from sb3_tbc.level.acting import ActingLevel
 from sb3_tbc.smdp.options import OptionClock, OptionRules
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.smdp.views import LevelViews
@@ -24,7 +24,7 @@ class Reconsideration:
     :param margin: in the high level's rewards
     """
 
-    def __init__(self, high: SACLevel, views: LevelViews, rules: OptionRules, margin: float) -> None:
+    def __init__(self, high: ActingLevel, views: LevelViews, rules: OptionRules, margin: float) -> None:
         self.high, self.views, self.rules, self.margin = high, views, rules, margin
         self._rng = np.random.default_rng(0)  # the mean needs no noise
 

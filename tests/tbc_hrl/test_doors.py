@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import pickle
 from typing import Any
 
 import cloudpickle
@@ -200,3 +201,23 @@ def test_what_is_not_finite_is_refused_where_it_enters() -> None:
         with pytest.raises(FloatingPointError, match=f"environment 1, step 3 of its episode: .*{key}"):
             model.learn(100)
         assert model.replay_buffer.low.size() == 0
+
+
+def test_a_policy_travels_without_what_it_learns_from(tmp_path: Any) -> None:
+    """Neither replay buffers nor open log files: it can be copied and sent to another process."""
+    pytest.importorskip("tensorboard")
+    model = TBCHRL(
+        "MultiInputPolicy", Corridor(), max_options=5, compile=False, seed=0, tensorboard_log=str(tmp_path)
+    ).learn(200)
+    sent = pickle.dumps(model.policy)
+    assert len(sent) < 5_000_000  # weights, and the moments of their optimizers
+    seen = Corridor().reset(seed=0)[0]
+    wanted, _ = model.policy.predict(seen, deterministic=True)
+    for policy in (pickle.loads(sent), copy.deepcopy(model.policy)):
+        np.testing.assert_array_equal(policy.predict(seen, deterministic=True)[0], wanted)
+        assert policy.low_policy is policy.actor.low.policy is not model.low.policy
+        with th.no_grad():
+            for parameter in policy.low_policy.average_actor.parameters():
+                parameter.zero_()
+        assert not np.array_equal(policy.predict(seen, deterministic=True)[0], wanted)
+    np.testing.assert_array_equal(model.policy.predict(seen, deterministic=True)[0], wanted)

@@ -98,7 +98,7 @@ def test_values_are_the_lowest_of_the_critics(agent: TBCHRL) -> None:
     seen = rng.normal(size=(7, agent.high.policy.observation_space.shape[0])).astype(np.float32)  # type: ignore[index]
     actions = rng.uniform(-1, 1, (7, 2)).astype(np.float32)
     critics = [q.detach().numpy()[:, 0] for q in agent.high.policy.critic(th.as_tensor(seen), th.as_tensor(actions))]
-    assert agent.high.values(seen, actions) == pytest.approx(np.minimum(*critics), rel=1e-6)
+    assert agent.high.acting.values(seen, actions) == pytest.approx(np.minimum(*critics), rel=1e-6)
 
 
 def reasons(agent: TBCHRL, steps: int = 300) -> set[str]:
