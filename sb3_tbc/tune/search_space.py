@@ -27,7 +27,7 @@ Values = Plain
 """Parameter name -> value, as a trial holds it."""
 
 SCHEDULE = "learning_rate_schedule"
-"""Parameter without a setting of its own: with ``linear`` the searched learning rates fall to zero."""
+"""Parameter without a value of its own: with ``linear`` the learning rates among its keys fall to zero."""
 SCHEDULES = ("constant", "linear")
 RATES = ("low.learning_rate", "low.actor_learning_rate", "high.learning_rate")
 FALLBACK = {"low.actor_learning_rate": "low.learning_rate"}
@@ -102,7 +102,8 @@ class Parameter:
     def read(self, run: RunConfig) -> object:
         """The value that corresponds to a configuration's settings, None if there is none."""
         if self.name == SCHEDULE:
-            rates = [read_key(run, f"{level}.learning_rate") for level in ("low", "high")]
+            keys = [key for key in self.keys if key not in FALLBACK] or self.keys  # an actor's rate alone does not tell
+            rates = [read_key(run, key) for key in keys]
             return SCHEDULES[any(isinstance(rate, str) and rate.startswith("lin_") for rate in rates)]
         if self.sets:
             by_size = sorted(self.sets.items(), key=lambda item: -len(item[1]))
@@ -144,10 +145,7 @@ def _default(algo: str, key: str) -> object:
     """An algorithm's default of a dotted key; None if it has no such setting."""
     if algo not in CONFIG_CLASSES:
         return None
-    value: object = CONFIG_CLASSES[algo]().to_dict()
-    for name in key.split("."):
-        value = value.get(name) if isinstance(value, Mapping) else None
-    return value
+    return _written(CONFIG_CLASSES[algo]().to_dict(), key)
 
 
 def nested(settings: PlainMapping) -> Plain:
@@ -234,7 +232,7 @@ def _parameter(name: str, fields: object) -> Parameter:
     for key in fields:
         if key not in FIELDS:
             raise ConfigError(f"{where}: unknown field {key!r}; {nearest(str(key), FIELDS)}")
-    keys = tuple(fields.get("keys") or ((name,) if name != SCHEDULE else ()))
+    keys = tuple(fields.get("keys") or ((name,) if name != SCHEDULE else RATES))
     when = fields.get("when")
     if when is not None and not (isinstance(when, Mapping) and len(when) == 1):
         raise ConfigError(f"{where}: 'when' takes one parameter and its value, got {when!r}")
@@ -265,6 +263,8 @@ def _choice(
         )
     if name == SCHEDULE and not set(labels) <= set(SCHEDULES):
         raise ConfigError(f"{where} must be among {', '.join(SCHEDULES)}, got {list(labels)}")
+    if name == SCHEDULE and not set(keys) <= set(RATES):
+        raise ConfigError(f"{where}: keys must be among {', '.join(RATES)}, got {list(keys)}")
     parameter = Parameter(name, keys, choices=labels, sets={k: dict(v or {}) for k, v in sets.items()}, when=when)
     for label in labels:
         _check_keys(parameter, label, where)
@@ -293,11 +293,14 @@ def restrict(
             raise ConfigError(f"--search {pattern!r} matches no parameter; {nearest(pattern, declared)}")
     space = {p.name: p for p in build_space(declared)}
     idle = _idle_keys(run)
+    searched = {key for p in space.values() if p.name != SCHEDULE and _is_wanted(p.name, wanted) for key in p.keys}
     left: dict[str, Plain] = {}
     for name, parameter in space.items():
         keys = tuple(key for key in parameter.keys if not _is_set(fixed, key))
+        if name == SCHEDULE:
+            keys = tuple(key for key in keys if key in searched or not _follows_another(run, key))
         without = (parameter.keys and not keys) or any(_is_set(fixed, k) for s in parameter.sets.values() for k in s)
-        if without or (wanted and not any(fnmatch.fnmatch(name, pattern) for pattern in wanted)):
+        if without or not _is_wanted(name, wanted):
             continue
         if any(key.startswith(idle) for key in (*keys, *(k for s in parameter.sets.values() for k in s))):
             continue
@@ -312,12 +315,29 @@ def restrict(
     return left
 
 
+def _is_wanted(name: str, patterns: Sequence[str]) -> bool:
+    return not patterns or any(fnmatch.fnmatch(name, pattern) for pattern in patterns)
+
+
 def _idle_keys(run: RunConfig) -> tuple[str, ...]:
     """Prefixes of keys without effect: a circuit's if there is none, ``kappa`` if the rule is not used."""
     idle = [] if read_key(run, CIRCUIT) is not None else [CIRCUIT]
     if read_key(run, "duration") != "rule" and not read_key(run, "duration_loss_coef"):
         idle.append("kappa")
     return tuple(idle)
+
+
+def _follows_another(run: RunConfig, key: str) -> bool:
+    """Whether a setting is not set, so that it has the value of another, see :data:`FALLBACK`."""
+    return key in FALLBACK and _written(run.model, key) is None
+
+
+def _written(settings: PlainMapping, key: str) -> object:
+    """The value that nested settings give to a dotted key, None if they do not set it."""
+    value: object = settings
+    for name in key.split("."):
+        value = value.get(name) if isinstance(value, Mapping) else None
+    return value
 
 
 def _is_set(settings: PlainMapping, key: str) -> bool:
@@ -368,8 +388,8 @@ def apply(space: Space, values: PlainMapping, run: RunConfig) -> RunConfig:
     for parameter in space:
         if parameter.name in values and parameter.name != SCHEDULE:
             settings.update(parameter.settings(values[parameter.name]))
-    if SCHEDULE in values:
-        for key in RATES:
+    for key in next((parameter.keys for parameter in space if parameter.name == SCHEDULE), ()):
+        if SCHEDULE in values and (key in settings or not _follows_another(run, key)):
             rate = _plain(settings.get(key, read_key(run, key)))
             settings[key] = f"lin_{rate!r}" if values[SCHEDULE] == "linear" else rate
     change = validate(nested(settings), run.algo, "trial")

@@ -114,6 +114,39 @@ def test_an_actor_without_a_rate_of_its_own_has_its_critics() -> None:
     assert changed.model["low"]["learning_rate"] == "lin_0.006763"
 
 
+@pytest.mark.parametrize("schedule", ["constant", "linear"])
+@pytest.mark.parametrize("algo", ["hits", "hac"])
+def test_an_unset_actor_rate_follows_the_searched_one(algo: str, schedule: str) -> None:
+    run = load_config(algo, "Pendulum")
+    space = build_space(restrict(load_space(algo, "Pendulum"), run, (), {}))
+    low = apply(space, {"learning_rate_schedule": schedule, "low.learning_rate": 0.00125}, run).model["low"]
+    assert low["learning_rate"] == (0.00125 if schedule == "constant" else "lin_0.00125")
+    assert low.get("actor_learning_rate") is None
+    own = load_config(algo, "Pendulum", overrides=parse_overrides(["low.actor_learning_rate:0.01"]))
+    space = build_space(restrict(load_space(algo, "Pendulum"), own, (), {}))  # as if a file had set it
+    low = apply(space, {"learning_rate_schedule": schedule, "low.learning_rate": 0.00125}, own).model["low"]
+    assert low["actor_learning_rate"] == (0.01 if schedule == "constant" else "lin_0.01")
+
+
+def test_a_rate_of_the_command_line_stays_as_it_is() -> None:
+    def changed(*fixed: str, algo: str = "tbc-hrl", schedule: str = "linear") -> dict[str, Any]:
+        given = parse_overrides(fixed)
+        run = load_config(algo, "Pendulum", "paper", given)
+        space = build_space(restrict(load_space(algo, "Pendulum"), run, (), given))
+        return apply(space, {"learning_rate_schedule": schedule}, run).model
+
+    model = changed("low.learning_rate:1e-3")
+    assert model["low"]["learning_rate"] == 1e-3
+    assert str(model["high"]["learning_rate"]).startswith("lin_")
+    assert changed("low.learning_rate:lin_1e-3", schedule="constant")["low"]["learning_rate"] == "lin_1e-3"
+    both = ("low.learning_rate:1e-3", "high.learning_rate:1e-3")
+    assert changed(*both)["high"]["learning_rate"] == 1e-3
+    for algo, searched in (("tbc-hrl", True), ("hits", False)):  # only tbc-hrl searches the actor's rate as well
+        run, given = load_config(algo, "Pendulum", overrides=parse_overrides(both)), parse_overrides(both)
+        left = restrict(load_space(algo, "Pendulum"), run, (), given)
+        assert ("learning_rate_schedule" in left) == searched
+
+
 def test_a_value_outside_of_a_range_is_left_out() -> None:
     run = load_config("tbc-hrl", "Drawbridge", "paper")
     space = build_space(
@@ -188,6 +221,7 @@ def test_an_unknown_task_gets_the_agents_own_circuit() -> None:
         ("default: {memory: {choices: [window, both]}}", r"memory must be one of"),
         ("default: {low.ent_coef: {when: {low.temp: fixed}}}", r"'when' must name a parameter above it"),
         ("default: {learning_rate_schedule: {choices: [cosine]}}", r"must be among constant, linear"),
+        ("default: {learning_rate_schedule: {keys: [low.tau]}}", r"keys must be among low\.learning_rate, low\.actor"),
         ("default: {tau: 3}", r"tau must have fields"),
         ("default: 3", r"expected sections"),
         ("default: {a: [}", r"cannot read .*: it is no YAML"),
