@@ -330,10 +330,15 @@ def retire_stale(study: Study) -> None:
         fail_stale_trials(study)
 
 
-def requeue(study: Study, trial: FrozenTrial) -> None:
-    """Put a trial that the user stopped back into the queue, with the seeds it has finished."""
+def requeue(study: Study, trial: FrozenTrial, most: int | None = None) -> bool:
+    """Put a trial back into the queue, with the seeds it has finished, and return whether that was done.
+
+    :param most: how often a trial is run again at most, by default without end
+    """
+    retries = len(trial.system_attrs.get("retry_history", ()))
     with _quiet():
-        RetryHeartbeatStaleTrialCallback(max_retry=None)(study, trial)
+        RetryHeartbeatStaleTrialCallback(max_retry=most)(study, trial)
+    return most is None or retries < most
 
 
 # --------------------------------------------------------------------------------------------- samplers

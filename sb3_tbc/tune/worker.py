@@ -21,9 +21,11 @@ from optuna.trial import FrozenTrial, TrialState
 
 from sb3_tbc.commands import INTERRUPTED, USER_MISTAKE
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.outside import one_line
 from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.tune.pruning import SEED_VALUES, make_pruner
 from sb3_tbc.tune.study import (
+    MAX_RETRIES,
     ORIGIN,
     REASON,
     count_done,
@@ -125,24 +127,39 @@ def _one_trial(study: Study, runner: TrialRunner, index: int) -> None:
         study.optimize(objective, n_trials=1)
     except Surplus:
         return
-    except (optuna.exceptions.UpdateFinishedTrialError, ValueError) as error:
-        if not _was_taken(error):
-            raise
-        _say(
-            index,
-            f"trial {started[-1]} is dropped here: another worker has it, because this one was silent too long",
-        )
-        return
     except (Stopped, KeyboardInterrupt) as stopped:
         if started:
             _put_back(study, started[-1])
         raise KeyboardInterrupt from stopped
+    except Exception as error:
+        if started and _was_taken(error):
+            number = started[-1]
+            _say(index, f"trial {number} is dropped here: another worker has it, because this one was silent too long")
+            return
+        if started:
+            _say(index, _retry(study, started[-1], error))
+        raise
     _say(index, describe(study.trials[started[-1]]))
 
 
 def _was_taken(error: Exception) -> bool:
     """Whether a trial that still ran here had been marked as failed, because its worker counted as dead."""
-    return isinstance(error, optuna.exceptions.UpdateFinishedTrialError) or str(error).startswith("Cannot tell")
+    refused = isinstance(error, ValueError) and str(error).startswith("Cannot tell")
+    return refused or isinstance(error, optuna.exceptions.UpdateFinishedTrialError)
+
+
+def _retry(study: Study, number: int, error: Exception) -> str:
+    """Queue a trial again in which an error was raised, as those of dead workers are; return a line about it.
+
+    The fault may be the machine's, and then another run succeeds. If it is the trial's, the retries are counted.
+    """
+    failed = f"trial {number} failed: {type(error).__name__}: {one_line(error)}"
+    trial = study.trials[number]
+    if trial.state != TrialState.FAIL:  # the storage failed as well, so the trial will be found without a heartbeat
+        return failed
+    if requeue(study, trial, MAX_RETRIES):
+        return f"{failed}; it is back in the queue"
+    return f"{failed}; this was retry {MAX_RETRIES}, so it is not run again"
 
 
 def _put_back(study: Study, number: int) -> None:
@@ -202,7 +219,8 @@ def _watch(workers: Sequence[BaseProcess], stop: StopRequest) -> None:
                 print(f"{worker.name} was stopped; its trial is back in the queue", file=sys.stderr)
             elif code != 0:
                 how = f"signal {-code}" if code < 0 else f"exit status {code}"
-                print(f"{worker.name} ended with {how}; its trial will be run again by another", file=sys.stderr)
+                again = "; its trial will be run again by another" if code < 0 else ""  # else the worker has told it
+                print(f"{worker.name} ended with {how}{again}", file=sys.stderr)
         time.sleep(0.2)
 
 

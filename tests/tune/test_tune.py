@@ -10,6 +10,7 @@ import sys
 import threading
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -277,6 +278,52 @@ def test_a_stopped_trial_goes_back_into_the_queue(
     assert study.trials[1].user_attrs[ORIGIN] == "default"
     assert study.trials[1].params == study.trials[0].params
     assert seeds == [0, 1, 1, 0, 1]  # the finished seed of the stopped trial is not trained twice
+
+
+def test_a_trial_that_raised_an_error_is_run_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail_once(spec: Any, folder: Any, after_eval: Any) -> None:
+        if spec.variant == "trial_0" and spec.seed == 1:
+            raise KeyError("a bug")
+
+    seeds = quick(monkeypatch, fail_once)
+    with pytest.raises(KeyError):
+        tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY))
+    assert "trial 0 failed: KeyError: 'a bug'; it is back in the queue" in capsys.readouterr().out
+    assert [t.state for t in load(tmp_path).trials] == [TrialState.FAIL, TrialState.WAITING]
+    assert tune.main(arguments(tmp_path, "--n-trials", "2")) == 0
+    study = load(tmp_path)
+    assert [t.state for t in study.trials] == [TrialState.FAIL, TrialState.COMPLETE, TrialState.COMPLETE]
+    assert [t.user_attrs.get(ORIGIN) for t in study.trials] == ["default", "default", None]
+    assert study.trials[1].params == study.trials[0].params
+    assert seeds == [0, 1, 1, 0, 1]
+
+
+def test_a_trial_that_always_raises_an_error_is_given_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(spec: Any, folder: Any, after_eval: Any) -> None:
+        if spec.variant != "trial_0":
+            raise ValueError("no such thing")  # no answer of the storage, although its type is the same
+
+    quick(monkeypatch, fail)
+    for _ in range(1 + studies.MAX_RETRIES):
+        with pytest.raises(ValueError, match="no such thing"):
+            tune.main(arguments(tmp_path, "--n-trials", "2", *SHORT, *TINY))
+    assert "this was retry 3, so it is not run again" in capsys.readouterr().out.splitlines()[-1]
+    states = [t.state for t in load(tmp_path).trials]
+    assert states == [TrialState.COMPLETE] + (1 + studies.MAX_RETRIES) * [TrialState.FAIL]
+
+
+def test_only_a_killed_workers_trial_is_announced_by_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    codes = {"worker 0": -9, "worker 1": 1}
+    ended: Any = [SimpleNamespace(name=name, exitcode=code, is_alive=lambda: False) for name, code in codes.items()]
+    worker._watch(ended, StopRequest())
+    assert capsys.readouterr().err.splitlines() == [
+        "worker 0 ended with signal 9; its trial will be run again by another",
+        "worker 1 ended with exit status 1",
+    ]
 
 
 def test_a_dead_workers_trial_is_run_again_and_counted_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
