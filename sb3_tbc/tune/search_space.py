@@ -7,6 +7,7 @@ Nothing here imports Optuna: a space is data, and a trial is any object with ``s
 from __future__ import annotations
 
 import fnmatch
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -240,16 +241,38 @@ def _parameter(name: str, fields: object) -> Parameter:
     choices = fields.get("choices")
     if choices is not None:
         return _choice(name, keys, choices, condition, where)
+    return _range(name, keys, fields, condition, where)
+
+
+def _range(
+    name: str, keys: tuple[str, ...], fields: PlainMapping, when: tuple[str, object] | None, where: str
+) -> Parameter:
     low, high, log, step = (fields.get(key) for key in ("low", "high", "log", "step"))
-    if not isinstance(low, int | float) or not isinstance(high, int | float) or not low <= high:
+    if not _is_number(low) or not _is_number(high) or not low <= high:
         raise ConfigError(f"{where} needs low and high with low <= high, or choices, got {dict(fields)}")
     if log and low <= 0:
         raise ConfigError(f"{where}: a logarithmic range must begin above 0, got {low}")
+    if step is not None and (not _is_number(step) or step <= 0):
+        raise ConfigError(f"{where}: step must be a number above 0, got {step!r}; leave it out for none")
     if log and step:
         raise ConfigError(f"{where}: log and step exclude each other")
-    parameter = Parameter(name, keys, low, high, bool(log), step, when=condition)
-    _check_keys(parameter, low, where)
+    low, high = (_end(name, keys, value, where) for value in (low, high))
+    parameter = Parameter(name, keys, low, high, bool(log), step, when=when)
+    if parameter.whole and step is not None and not float(step).is_integer():
+        raise ConfigError(f"{where}: step must be whole where low and high are, got {step}")
     return parameter
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _end(name: str, keys: tuple[str, ...], value: float, where: str) -> float:
+    """An end of a range, checked as a value of its settings; a whole float (``1e5``) as an integer if they all are."""
+    if name == SCHEDULE:
+        raise ConfigError(f"{where} needs choices, not low and high")
+    checked = [_written(validate(nested({key: value}), None, where), key) for key in keys]
+    return int(value) if all(isinstance(number, int) for number in checked) else value
 
 
 def _choice(

@@ -211,6 +211,19 @@ def test_an_unknown_task_gets_the_agents_own_circuit() -> None:
     assert complete(hits, 3) == hits
 
 
+def test_whole_floats_are_ends_of_whole_ranges(tmp_path: Path) -> None:
+    path = tmp_path / "mine.yml"
+    sizes = "low.buffer_size: {low: 1000, high: 1e5}, high.buffer_size: {low: 1e3, high: 1.0e+4}"
+    path.write_text(f"default: {{{sizes}, low.gamma: {{low: 0.0, high: 1.0}}}}\n")
+    run, declared = load_config("hits", "Pendulum"), load_space("hits", "Pendulum", path)
+    space = {p.name: p for p in build_space(declared)}
+    assert all(space[f"{level}.buffer_size"].whole for level in ("low", "high"))
+    assert not space["low.gamma"].whole
+    assert type(space["low.buffer_size"].high) is int
+    model = apply(build_space(declared), {"low.buffer_size": space["low.buffer_size"].high}, run).model
+    assert model["low"]["buffer_size"] == 100_000
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -222,6 +235,16 @@ def test_an_unknown_task_gets_the_agents_own_circuit() -> None:
         ("default: {low.ent_coef: {when: {low.temp: fixed}}}", r"'when' must name a parameter above it"),
         ("default: {learning_rate_schedule: {choices: [cosine]}}", r"must be among constant, linear"),
         ("default: {learning_rate_schedule: {keys: [low.tau]}}", r"keys must be among low\.learning_rate, low\.actor"),
+        ("default: {learning_rate_schedule: {low: 0, high: 1}}", r"learning_rate_schedule needs choices"),
+        ("default: {low.gamma: {low: .9, high: 1.5}}", r"low\.gamma must be a number from 0 to 1, got 1\.5"),
+        ("default: {low.buffer_size: {low: 1000, high: 99999.5}}", r"low\.buffer_size must be a whole number"),
+        ("default: {low.gamma: {low: .9, high: .inf}}", r"needs low and high"),
+        ("default: {low.gamma: {low: .9, high: .99, step: 0}}", r"step must be a number above 0, got 0;"),
+        ("default: {low.gamma: {low: .9, high: .99, step: wide}}", r"step must be a number above 0, got 'wide';"),
+        (
+            "default: {n_hindsight_goals: {low: 3, high: 9, step: 0.5}}",
+            r"step must be whole where low and high are, got 0\.5",
+        ),
         ("default: {tau: 3}", r"tau must have fields"),
         ("default: 3", r"expected sections"),
         ("default: {a: [}", r"cannot read .*: it is no YAML"),
