@@ -53,6 +53,21 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
         return f"{text} (default: %(default)s)"
 
 
+class Several(argparse.Action):
+    """An option of several values that may be given more than once; the first values replace the default."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(nargs="+", **settings)
+
+    def __call__(
+        self, parser: argparse.ArgumentParser, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
+        """Add the values to those given before."""
+        given = getattr(namespace, self.dest)
+        earlier = [] if given is None or given is self.default else given
+        setattr(namespace, self.dest, [*earlier, *values])
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser whose help ends with examples and whose errors are one line, without the usage text.
 
@@ -68,6 +83,8 @@ class Parser(argparse.ArgumentParser):
         lines = [f"  # {purpose}\n  python -m {line}" for line, purpose in (examples or {}).items()]
         epilog = "examples:\n" + "\n".join(lines) if lines else None
         text = (description or "").replace("``", "")
+        # without abbreviations: --seed would be taken for --seeds
+        settings = {"allow_abbrev": False, **settings}
         super().__init__(prog, description=text, formatter_class=HelpFormatter, epilog=epilog, **settings)
 
     def error(self, message: str) -> NoReturn:

@@ -18,7 +18,16 @@ from sb3_tbc.campaign.executors import Executor, LocalExecutor, RayExecutor, Slu
 from sb3_tbc.campaign.hours import plan, read_speeds
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
-from sb3_tbc.commands import FAILED, INTERRUPTED, Parser, positive_int, run_command, seed_number, stop_like_ctrl_c
+from sb3_tbc.commands import (
+    FAILED,
+    INTERRUPTED,
+    Parser,
+    Several,
+    positive_int,
+    run_command,
+    seed_number,
+    stop_like_ctrl_c,
+)
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
 from sb3_tbc.train import N_EVAL_EPISODES, build_spec, default_eval_freq, variant_name
@@ -43,8 +52,8 @@ def build_parser() -> Parser:
     """The command's arguments."""
     parser = Parser("sb3_tbc.reproduce", EXAMPLES, description=__doc__)
     add = parser.add_argument_group("which runs").add_argument
-    add("--tasks", nargs="+", default=sorted(task_names()), help="by default all of them")
-    add("--algos", nargs="+", default=sorted(ALGORITHMS), help="by default all of them: hac, hits, sac, tbc-hrl")
+    add("--tasks", action=Several, default=sorted(task_names()), help="by default all of them")
+    add("--algos", action=Several, default=sorted(ALGORITHMS), help="by default all of them: hac, hits, sac, tbc-hrl")
     add("--seeds", type=positive_int, default=10, help="seeds of each task and method; the paper has 10")
     add("--first-seed", type=seed_number, default=0, help="the first seed; the others are the numbers that follow it")
     add(
@@ -56,7 +65,7 @@ def build_parser() -> Parser:
     add("--ablations", action="store_true", help="every ablation that changes something in a task's settings; "
         "needs --algos tbc-hrl")  # fmt: skip
     add("--variant", help="name of the runs' folder; by default as in sb3_tbc.train")
-    add("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, as in sb3_tbc.train")
+    add("--hyperparams", action=Several, default=[], metavar="NAME:VALUE", help="single settings, as in sb3_tbc.train")
     add("--n-timesteps", type=positive_int, help="environment steps of each run; by default the task's")
     add("--eval-freq", type=positive_int, help="steps between evaluations; by default a fortieth of the run")
     add("--n-eval-episodes", type=positive_int, help=f"episodes of each evaluation (default: {N_EVAL_EPISODES})")
@@ -65,8 +74,8 @@ def build_parser() -> Parser:
     add("--workers", type=positive_int, default=1, help="runs at the same time, one thread each")
     add("--executor", choices=["local", "slurm", "ray"], default="local", help="local: processes on this machine; "
         "slurm, ray: a cluster whose machines all see the folders below (extra cluster)")  # fmt: skip
-    add("--slurm", nargs="+", default=[], metavar="NAME:VALUE", help="settings of the Slurm jobs, as submitit names "
-        "them, e.g. slurm_partition:short timeout_min:600")  # fmt: skip
+    add("--slurm", action=Several, default=[], metavar="NAME:VALUE", help="settings of the Slurm jobs, as submitit "
+        "names them, e.g. slurm_partition:short timeout_min:600")  # fmt: skip
     add("--address", help="address of the Ray cluster; by default RAY_ADDRESS, or a new cluster on this machine")
     add("--dry-run", action="store_true", help="print what would be run and how long it takes, and stop")
     add("--log-folder", type=Path, default=Path("runs"), help="folder of the runs")

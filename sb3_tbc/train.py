@@ -13,7 +13,7 @@ from typing import Any
 import torch as th
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import INTERRUPTED, Parser, add_trust, positive_int, run_command, seed_number
+from sb3_tbc.commands import INTERRUPTED, Parser, Several, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
@@ -61,8 +61,8 @@ def build_parser() -> Parser:
     what.add_argument(
         "--ablation", metavar="NAME", help=f"leave a part of the method out, or put one in: {', '.join(ABLATIONS)}"
     )
-    what.add_argument("--hyperparams", nargs="+", default=[], metavar="NAME:VALUE", help="single settings, which win "
-                      "over the configuration; dots lead into a level, e.g. low.learning_rate:1e-3")  # fmt: skip
+    what.add_argument("--hyperparams", action=Several, default=[], metavar="NAME:VALUE", help="single settings, which "
+                      "win over the configuration; dots lead into a level, e.g. low.learning_rate:1e-3")  # fmt: skip
     what.add_argument("--on-bad-step", choices=["stop", "end-episode"], help="what follows where the environment "
                       "gives a value that is not finite, or of a wrong shape: stop the run, saved (default), or end "
                       "the episode with the step before; short for the setting on_bad_step")  # fmt: skip

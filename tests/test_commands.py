@@ -97,6 +97,32 @@ def test_every_option_says_what_it_is_for(name: str) -> None:
         assert not [riddle for riddle in RIDDLES if riddle in str(action.help)]
 
 
+@pytest.mark.parametrize("name", parsers())
+def test_an_option_given_again_adds_its_values(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    parser = parsers()[name]
+    for action in parser._actions:
+        if action.nargs in ("+", "*") and action.option_strings:
+            monkeypatch.setattr(action, "type", None)
+            (option,), default = action.option_strings, list(action.default or [])
+            args = parser.parse_args([option, "a", option, "b", "c"])
+            assert getattr(args, action.dest) == ["a", "b", "c"], option
+            assert list(action.default or []) == default
+
+
+def test_settings_are_given_in_one_or_several_options() -> None:
+    given = ["--hyperparams", "low.gamma:0.9", "--hyperparams", "max_options:5"]
+    for parser in (train.build_parser(), tune.build_parser(), import_module("sb3_tbc.reproduce").build_parser()):
+        assert parser.parse_args(given).hyperparams == ["low.gamma:0.9", "max_options:5"]
+
+
+def test_options_are_not_abbreviated(capsys: pytest.CaptureFixture[str]) -> None:
+    for name, given in (("reproduce", ["--seed", "300"]), ("benchmark fit", ["--actor", "mlp"])):
+        with pytest.raises(SystemExit) as stopped:
+            parsers()[name].parse_args(given)
+        assert stopped.value.code == 2
+        assert f"unrecognized arguments: {given[0]}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("config", [TBCConfig, FlatConfig])
 def test_every_setting_is_explained_without_riddles(config: type[Settings]) -> None:
     for entry in entries(config):

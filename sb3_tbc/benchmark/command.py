@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
+from sb3_tbc.commands import Parser, Several, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
@@ -54,9 +54,9 @@ def _add_cells(commands: Commands) -> None:
 
 def _add_fit(commands: Commands) -> None:
     fit = commands.add_parser("fit", help="how fast and how well actors learn recorded skills and delays by imitation")
-    fit.add_argument("--tasks", nargs="+", metavar="SKILL", help="tasks that have a recording, and delay3, delay10, "
-                     "delay30 or another delay; by default all of these")  # fmt: skip
-    fit.add_argument("--actors", nargs="+", metavar="ACTOR", default=["paper", "lean", "lean,reflex", "mlp"],
+    fit.add_argument("--tasks", action=Several, metavar="SKILL", help="tasks that have a recording, and delay3, "
+                     "delay10, delay30 or another delay; by default all of these")  # fmt: skip
+    fit.add_argument("--actors", action=Several, metavar="ACTOR", default=["paper", "lean", "lean,reflex", "mlp"],
                      help="paper: table A1's circuit; lean: the same with lean synapses; either with options after "
                      "commas: reflex; full (fans); equal (neurons added, for as many parameters as paper has); "
                      "slow (command neurons); gains (of 6 to 12); centred (logistics half open at the start); standard "
@@ -66,7 +66,7 @@ def _add_fit(commands: Commands) -> None:
                      "widths, mlp:1300: about 1300 parameters; gru:16: a GRU of 16 units. All with optimizer=nadam or "
                      "radam, and with a single learning rate as in lean,rate=3e-2. By default paper, lean, lean,reflex "
                      "and mlp")  # fmt: skip
-    fit.add_argument("--steps", nargs="+", type=positive_int, default=[500, 1000, 2000, 8000], metavar="N",
+    fit.add_argument("--steps", action=Several, type=positive_int, default=[500, 1000, 2000, 8000], metavar="N",
                      help="Adam steps after which to measure the fit; by default 500, 1000, 2000 and 8000")  # fmt: skip
     fit.add_argument(
         "--seeds", type=positive_int, default=1, help="number of seeds per actor; figures are means over them"
@@ -95,7 +95,7 @@ def _add_train(commands: Commands) -> None:
     train = commands.add_parser("train", help="training speed beside SB3's SAC and SBX's, and where the time goes")
     train.add_argument("tasks", nargs="*", default=["Pendulum", "Drawbridge"], metavar="TASK",
                        help="tasks to measure; by default Pendulum and Drawbridge")  # fmt: skip
-    train.add_argument("--what", nargs="+", default=["speed", "split", "update"], metavar="WHAT",
+    train.add_argument("--what", action=Several, default=["speed", "split", "update"], metavar="WHAT",
                        help="any of speed, split, floor, update, growth, n-envs, memory, budget; by default speed, "
                        "split and update")  # fmt: skip
     train.add_argument("--config", choices=CONFIGS, help="values of the task's settings; by default tuned, for tasks "

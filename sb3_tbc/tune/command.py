@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch as th
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import INTERRUPTED, Parser, positive_int, run_command, seed_number
+from sb3_tbc.commands import INTERRUPTED, Parser, Several, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.outside import flat_name, folder_name
@@ -111,8 +111,8 @@ def build_parser() -> Parser:
     add("--config", choices=CONFIGS, help="values of all settings that are not searched; by default tuned, for tasks "
                        "that have them")  # fmt: skip
     add("--config-file", type=Path, help="take these values from this file, with sections as in zoo_configs")
-    add("--hyperparams", nargs="+", metavar="NAME:VALUE", help="settings that keep this value in all trials")
-    add("--search", nargs="+", metavar="NAME", help="search only these parameters; * and ? stand for other characters")
+    add("--hyperparams", action=Several, metavar="NAME:VALUE", help="settings that keep this value in all trials")
+    add("--search", action=Several, metavar="NAME", help="search only these parameters; * and ? are wildcards")
     add("--search-space", type=Path, help="a file that changes ranges, see zoo_configs/search")
     return parser
 
