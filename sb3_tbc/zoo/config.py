@@ -203,13 +203,27 @@ def load_config(
     subgoals = merged.pop("subgoals", None)
     if subgoals:  # belongs to the environment, and stays with it in a saved agent
         merged["env_kwargs"] = {**(merged.get("env_kwargs") or {}), "subgoals": subgoals}
-    run = {key: merged.pop(key) for key in RUN if merged.get(key) is not None}
-    if "n_timesteps" not in run:
+    run = _run_keys(merged, task, path)
+    return RunConfig(algo=algo, task=task, config=config, model=merged, **run)
+
+
+def _run_keys(merged: Plain, task: str, path: Path) -> Plain:
+    """Take the keys of the run out of merged settings; null stands for a key's default, as it does for a setting.
+
+    :raises ConfigError: without a number of steps, which has no default
+    """
+    found = {key: merged.pop(key) for key in RUN if key in merged}
+    if "n_timesteps" not in found:
         raise ConfigError(
             f"neither section {task} nor section default of {path} gives n_timesteps; your file replaces the shipped "
             "one as a whole, so start from a copy of that"
         )
-    return RunConfig(algo=algo, task=task, config=config, model=merged, **run)
+    if found["n_timesteps"] is None:
+        raise ConfigError(
+            f"n_timesteps must be a number of environment steps, got null in --hyperparams or in {path}; leave it out "
+            "there to have the task's"
+        )
+    return {key: value for key, value in found.items() if value is not None}
 
 
 def ablations_of(task: str, config: str | None = None) -> list[str]:

@@ -176,6 +176,21 @@ def test_order_default_task_tuned_command_line(tmp_path: Path) -> None:
     assert load_config("x", "AnotherEnv-v0", "paper", path=path).model["dt_min"] == 1
 
 
+def test_null_stands_for_the_default_of_a_run_key(tmp_path: Path) -> None:
+    shipped = load_config("tbc-hrl", "Pendulum")
+    assert load_config("tbc-hrl", "Pendulum", overrides=parse_overrides(["n_envs:null"])) == shipped
+    run = load_config("tbc-hrl", "UR5Reacher", overrides=parse_overrides(["env_kwargs:null"]))
+    assert load_config("tbc-hrl", "UR5Reacher").env_kwargs == {"observation": "compact"}
+    assert run.env_kwargs == {}
+    with pytest.raises(ConfigError, match=r"n_timesteps must be a number of environment steps, got null in --hyper"):
+        load_config("tbc-hrl", "Pendulum", overrides=parse_overrides(["n_timesteps:null"]))
+    path = tmp_path / "a.yml"
+    path.write_text("default: {n_timesteps: 10}\nT: {n_envs: null, env_kwargs: null}\nU: {n_timesteps: null}\n")
+    assert load_config("tbc-hrl", "T", path=path) == RunConfig("tbc-hrl", "T", "paper", 10)
+    with pytest.raises(ConfigError, match=r"got null in --hyperparams or in .*a\.yml; leave it out there"):
+        load_config("tbc-hrl", "U", path=path)
+
+
 def test_number_like_strings_become_numbers(tmp_path: Path) -> None:
     path = tmp_path / "a.yml"
     path.write_text("T: {n_timesteps: 1e3, low: {learning_rate: 3e-4, ent_coef: auto_0.1, batch_size: 1e2}}\n")
