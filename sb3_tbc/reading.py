@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.arrays import Arrays
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
@@ -21,6 +23,7 @@ MAX_BYTES = 4 * 2**20
 MAX_VALUES = 100_000
 """Most values of a YAML text once its aliases are written out; without a limit, a few bytes could mean billions."""
 MAX_DEPTH = 50
+FLOAT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$")
 UNNAMED = ' in "<unicode string>"'
 MAX_GROWTH = 2000
 SMALL = 2**26
@@ -47,15 +50,33 @@ def read_text(path: Path, most: int = MAX_BYTES) -> str:
         raise ConfigError(f"cannot read {path}: {one_line(error)}") from error
 
 
-def parse_yaml(text: str, what: str) -> Any:
+class SettingsLoader(yaml.SafeLoader):
+    """YAML 1.1 in which ``3e-4`` is a number, as people write it in settings; in quotes it is a text as ever."""
+
+
+class SettingsDumper(yaml.SafeDumper):
+    """Puts texts in quotes that :class:`SettingsLoader` would read as numbers."""
+
+
+for _kind in (SettingsLoader, SettingsDumper):
+    _kind.add_implicit_resolver("tag:yaml.org,2002:float", FLOAT, list("+-.0123456789"))
+
+
+def settings_yaml(data: PlainMapping) -> str:
+    """YAML of settings, which :func:`read_yaml` reads as the same data with :class:`SettingsLoader`."""
+    return yaml.dump(dict(data), Dumper=SettingsDumper, sort_keys=False)
+
+
+def parse_yaml(text: str, what: str, kind: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
     """Plain data of a YAML text; tags that would make other objects are refused.
 
     :param what: what the text is, for messages
+    :param kind: how plain scalars are read
     :raises ConfigError: if it is no YAML, or too large or too deep when its aliases are written out
     """
 
     def parse() -> Any:
-        loader = yaml.SafeLoader(text)  # not the parser in C, which crashes on deep nesting
+        loader = kind(text)  # not the parser in C, which crashes on deep nesting
         try:
             node = loader.get_single_node()
             if node is None:
@@ -68,12 +89,13 @@ def parse_yaml(text: str, what: str) -> Any:
     return _parsed(parse, what, "YAML")
 
 
-def read_yaml(path: Path) -> Any:
+def read_yaml(path: Path, kind: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
     """Plain data of a YAML file.
 
+    :param kind: how plain scalars are read
     :raises ConfigError: if it cannot be read
     """
-    return parse_yaml(read_text(path), str(path))
+    return parse_yaml(read_text(path), str(path), kind)
 
 
 def read_json(path: Path) -> Any:

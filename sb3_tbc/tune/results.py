@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import optuna
-import yaml
 from optuna.study import Study, StudyDirection
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import save_atomic, write_atomic
+from sb3_tbc.reading import settings_yaml
 from sb3_tbc.tune.pruning import SEED_VALUES
 from sb3_tbc.tune.study import ORIGIN, REASON, WORKER, StudySettings
 from sb3_tbc.zoo.config import RunConfig, merge
@@ -80,7 +80,7 @@ def trial_file(settings: StudySettings, trial: FrozenTrial, study_name: str) -> 
         f"# Objective {settings.objective}: {value} ({settings.across_seeds} over seeds {seeds or 'none finished'}),",
         f"# {run.n_timesteps} steps, evaluated every {settings.eval_freq} on {settings.n_eval_episodes} episodes.",
     ]
-    return "\n".join(lines) + "\n" + yaml.safe_dump({settings.task: section}, sort_keys=False)
+    return "\n".join(lines) + "\n" + settings_yaml({settings.task: section})
 
 
 def write_trial(settings: StudySettings, trial: FrozenTrial, study_name: str, path: Path) -> Path:

@@ -16,10 +16,10 @@ from typing import Protocol, TypeGuard
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
-from sb3_tbc.reading import read_yaml
+from sb3_tbc.reading import SettingsLoader, read_yaml
 from sb3_tbc.tbc_hrl.config import CircuitConfig
 from sb3_tbc.zoo.config import RunConfig, merge
-from sb3_tbc.zoo.schema import CONFIG_CLASSES, RUN, coerce, validate
+from sb3_tbc.zoo.schema import CONFIG_CLASSES, RUN, validate
 
 Label = str | int | float | bool | None
 """A value of a parameter: a number of its range, or one of its choices (the types that Optuna allows)."""
@@ -179,11 +179,10 @@ def read_sections(path: Path) -> dict[str, Plain]:
 
     :raises ConfigError: if it cannot be read or does not consist of sections of parameters
     """
-    data = read_yaml(path)
+    data = read_yaml(path, SettingsLoader)
     if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
         raise ConfigError(f"{path}: expected sections of parameters (default and one per task)")
-    sections: dict[str, Plain] = coerce(data)
-    return sections
+    return data
 
 
 def load_space(algo: str, task: str, extra: Path | None = None) -> dict[str, Plain]:

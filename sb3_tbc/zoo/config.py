@@ -10,9 +10,9 @@ from pathlib import Path
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.outside import one_line
-from sb3_tbc.reading import MAX_DEPTH, parse_yaml, read_yaml
+from sb3_tbc.reading import MAX_DEPTH, SettingsLoader, parse_yaml, read_yaml
 from sb3_tbc.tbc_hrl.config import TBCConfig
-from sb3_tbc.zoo.schema import RUN, coerce, validate
+from sb3_tbc.zoo.schema import RUN, validate
 
 CONFIGS = ("paper", "tuned")
 OF_PAPER = "-paper"
@@ -124,10 +124,10 @@ def read_file(path: Path, algo: str | None = None) -> dict[str, Plain]:
     :param algo: algorithm whose settings they are; None allows those of any
     :raises ConfigError: if it cannot be read or holds an unknown key or a wrong value
     """
-    data = read_yaml(path)
+    data = read_yaml(path, SettingsLoader)
     if not isinstance(data, dict) or not all(isinstance(section, dict) for section in data.values()):
         raise ConfigError(f"{path}: expected sections of keys (default and one per task)")
-    return {name: _checked(coerce(section), algo, f"{path.name}, section {name}") for name, section in data.items()}
+    return {name: _checked(section, algo, f"{path.name}, section {name}") for name, section in data.items()}
 
 
 def _checked(section: Plain, algo: str | None, where: str, inner: Sequence[str] = ("tuned",)) -> Plain:
@@ -156,11 +156,11 @@ def parse_overrides(items: Sequence[str]) -> Plain:
             )
         if name.count(".") > MAX_DEPTH:
             raise ConfigError(f"--hyperparams {one_line(item)!r}: more than {MAX_DEPTH} sections in one another")
-        value = parse_yaml(text, f"the value of --hyperparams {one_line(item)!r}")
+        value = parse_yaml(text, f"the value of --hyperparams {one_line(item)!r}", SettingsLoader)
         for key in reversed(name.split(".")):
             value = {key: value}
         result = merge(result, value)
-    return validate(coerce(result), None, "--hyperparams")
+    return validate(result, None, "--hyperparams")
 
 
 def load_config(

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, overload
+from typing import Annotated, Literal
 
-from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.settings import NotEmpty, Range, Settings, hints, read_partial
 from sb3_tbc.tbc_hrl.config import FlatConfig, HACConfig, HiTSConfig, TBCConfig
@@ -21,8 +19,6 @@ CONFIG_CLASSES: dict[str, type[Settings]] = {
 """Algorithm -> its settings."""
 
 Numbers = Annotated[tuple[float, ...], NotEmpty()]
-
-_FLOAT = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,25 +69,10 @@ def kinds_of(algo: str | None) -> Plain:
     return kinds
 
 
-@overload
-def coerce(value: PlainMapping) -> Plain: ...
-@overload
-def coerce(value: object) -> object: ...
-def coerce(value: object) -> object:
-    """Turn number-like strings into numbers, recursively: YAML 1.1 reads ``3e-4`` as text."""
-    if isinstance(value, Mapping):
-        return {key: coerce(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [coerce(item) for item in value]
-    if isinstance(value, str) and _FLOAT.fullmatch(value.strip()):
-        return float(value)
-    return value
-
-
 def validate(section: object, algo: str | None, where: str) -> Plain:
     """Check every key and value of a section and return it, with whole floats as integers where integers are expected.
 
-    :param section: the section as read from the file, numbers already coerced
+    :param section: the section as read from the file
     :param algo: algorithm whose settings are allowed, see :func:`kinds_of`
     :param where: file and section, for messages
     :raises ConfigError: for an unknown key or a value that is not allowed

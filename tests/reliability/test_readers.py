@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_arrays
 from sb3_tbc.outside import flat_name, folder_name, in_docstring, number, one_line, without_password
-from sb3_tbc.reading import parse_yaml, read_arrays, read_json, read_text, read_yaml
+from sb3_tbc.reading import SettingsLoader, parse_yaml, read_arrays, read_json, read_text, read_yaml, settings_yaml
 from sb3_tbc.tune.study import drop_half_line
 from sb3_tbc.zoo.config import parse_overrides, read_file
 from sb3_tbc.zoo.ledger import RunFolder
@@ -51,6 +51,19 @@ def test_yaml_that_is_refused(text: str, message: str, tmp_path: Path) -> None:
 def test_yaml_that_is_read() -> None:
     assert parse_yaml("a: &a {b: 1}\nc: {<<: *a, d: 2}", "it") == {"a": {"b": 1}, "c": {"b": 1, "d": 2}}
     assert parse_yaml("", "it") is None
+
+
+def test_numbers_of_settings_survive_writing_and_reading(tmp_path: Path) -> None:
+    data = {"a": 3e-4, "b": "3e-4", "c": "-.5E+3", "d": 12, "e": "12", "f": "089", "g": "lin_1e-3", "h": [1e37, None]}
+    path = tmp_path / "a.yml"
+    path.write_text(settings_yaml(data))
+    assert read_yaml(path, SettingsLoader) == data
+    plain = "[3e-4, 1E5, +1e5, .5e1, 12, 1_0, 2e3 steps]"
+    assert parse_yaml(plain, "it", SettingsLoader) == [3e-4, 1e5, 1e5, 5.0, 12, 10, "2e3 steps"]
+    assert parse_yaml("3e-4", "it") == "3e-4"  # files that programs write are YAML 1.1
+    assert not any(type(value) is float for value in parse_yaml("['3e-4', \"1e5\", !!str 1e5]", "it", SettingsLoader))
+    with pytest.raises(ConfigError, match="it is no YAML"):
+        parse_yaml("!!python/object/apply:os.getcwd []", "it", SettingsLoader)
 
 
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -26,7 +26,7 @@ from sb3_tbc.tune import command as tune
 from sb3_tbc.tune import study as studies
 from sb3_tbc.tune import trial as trials
 from sb3_tbc.tune import worker
-from sb3_tbc.tune.results import difference, find_trial, importances, write_plots
+from sb3_tbc.tune.results import difference, find_trial, importances, write_plots, write_trial
 from sb3_tbc.tune.study import ORIGIN, REASON, open_storage, read_settings
 from sb3_tbc.zoo.callbacks import SuccessEvalCallback, read_evaluations
 from sb3_tbc.zoo.config import load_config
@@ -451,6 +451,14 @@ def test_equal_trials_have_no_importances() -> None:
         distributions = {"idle": optuna.distributions.FloatDistribution(0, 1)}
         study.add_trial(optuna.create_trial(params={"idle": float(x)}, distributions=distributions, value=0.0))
     assert importances(study) == {}
+
+
+def test_a_text_that_looks_like_a_number_stays_one_in_a_trials_file(tmp_path: Path) -> None:
+    settings = tune.new_settings(tune.build_parser().parse_args(arguments(tmp_path, *SHORT, *TINY)))
+    run = {**settings.base, "env_kwargs": {"map": "3e-4"}}
+    trial = optuna.create_trial(value=0.0, user_attrs={ORIGIN: "default"})
+    path = write_trial(replace(settings, baselines={"default": run}), trial, "study", tmp_path / "best.yml")
+    assert load_config("tbc-hrl", "TunedCorridor-v0", path=path).env_kwargs == {"map": "3e-4"}
 
 
 def test_difference_is_what_merging_needs() -> None:

@@ -176,6 +176,18 @@ def test_order_default_task_tuned_command_line(tmp_path: Path) -> None:
     assert load_config("x", "AnotherEnv-v0", "paper", path=path).model["dt_min"] == 1
 
 
+def test_quoted_text_stays_text(tmp_path: Path) -> None:
+    assert parse_overrides(['env_kwargs.map:"007"']) == {"env_kwargs": {"map": "007"}}
+    assert parse_overrides(["env_kwargs.map:'3e-4'"]) == {"env_kwargs": {"map": "3e-4"}}
+    names = parse_overrides(['subgoals.names:["1","2"]'])["subgoals"]["names"]
+    assert list(names) == ["1", "2"]
+    path = tmp_path / "a.yml"
+    path.write_text("T: {n_timesteps: 10, env_kwargs: {map: '1e5', rate: 1e5, note: 1e5 or so}}\n")
+    assert load_config("x", "T", path=path).env_kwargs == {"map": "1e5", "rate": 1e5, "note": "1e5 or so"}
+    with pytest.raises(ConfigError, match=r"low\.learning_rate must be .*, got '3e-4'"):
+        parse_overrides(['low.learning_rate:"3e-4"'])
+
+
 def test_null_stands_for_the_default_of_a_run_key(tmp_path: Path) -> None:
     shipped = load_config("tbc-hrl", "Pendulum")
     assert load_config("tbc-hrl", "Pendulum", overrides=parse_overrides(["n_envs:null"])) == shipped
