@@ -66,7 +66,8 @@ def identify(path: Path, env: str | None, trust: bool = False) -> Plain:
         # Our own tasks take the same arguments, so a policy sees the layout it was trained with in another engine, too.
         own = all(str(i).startswith(NAMESPACE) for i in (env_id, info.get("env_id")))
         keep = own or env_id == info.get("env_id")
-        info.update(task=task, env_id=env_id, env_kwargs=info.get("env_kwargs", {}) if keep else {})
+        kept = info.get("env_kwargs")
+        info.update(task=task, env_id=env_id, env_kwargs=kept if keep and isinstance(kept, dict) else {})
         layout = layout_of(task, observation_size(data) or 0)
         if layout is not None and "observation" not in info["env_kwargs"]:  # saved by model.save, without arguments
             info["env_kwargs"] = {**info["env_kwargs"], "observation": layout}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import datetime
 import json
 import shutil
 import signal
@@ -15,6 +16,8 @@ import pytest
 import yaml
 
 from sb3_tbc import __main__, evaluate, train
+from sb3_tbc.zoo.algorithms import load_model
+from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.ledger import RunFolder
 
 TINY = ["--hyperparams", "compile:false", "gradient_ratio:0.05", "low.batch_size:16", "high.batch_size:4"]
@@ -346,6 +349,22 @@ def test_zips_that_are_none_of_ours(run: RunFolder, tmp_path: Path, capsys: pyte
         assert message in said(capsys)
     assert evaluate.main([str(run.model), "--env", "UR5Reacher", "--n-episodes", "1"]) == 2
     assert "trained on observations of 3 entries, the environment gives 48" in said(capsys)
+
+
+def test_arguments_of_an_environment_that_an_agents_file_cannot_give(
+    run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, env = tmp_path / "agent.zip", make_envs("sb3_tbc/Pendulum-v0", 1, 0)
+    agent = load_model(run.model, env)
+    agent.run_info["env_kwargs"] = {"day": datetime.date(2026, 1, 2)}  # type: ignore[union-attr]
+    agent.save(path)
+    env.close()
+    capsys.readouterr()
+    assert evaluate.main([str(path)]) == 2
+    error = said(capsys)
+    assert "does not give its environment's arguments as plain data but as \"{'day': datetime.date(2026" in error
+    assert "pass --env, and --trust if you trust the file" in error
+    assert evaluate.main([str(path), "--env", "Pendulum", "--trust", "--n-episodes", "1"]) == 0
 
 
 def test_a_flipped_byte_is_noticed(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

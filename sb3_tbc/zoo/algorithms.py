@@ -99,7 +99,12 @@ def environment_of(path: Path, data: Plain, trust: bool = False) -> tuple[str, P
     env_id, env_kwargs = info.get("env_id"), info.get("env_kwargs", {})
     if env_id is None:
         raise ConfigError(f"{path} does not say on which environment it was trained; pass --env")
-    if not isinstance(env_id, str) or not isinstance(env_kwargs, dict):
+    if not isinstance(env_kwargs, dict):
+        raise ConfigError(
+            f"{path} does not give its environment's arguments as plain data but as {one_line(env_kwargs)!r}; pass "
+            "--env, and --trust if you trust the file, to use the environment with its defaults"
+        )
+    if not isinstance(env_id, str):
         raise ConfigError(f"{path} gives {one_line(env_id)!r} where the id of an environment is expected; pass --env")
     module = env_id.rpartition(":")[0]
     if module and not trust and module != ROBOTICS and module not in sys.modules:

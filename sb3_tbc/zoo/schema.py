@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import datetime
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.settings import NotEmpty, Range, Settings, hints, read_partial
+from sb3_tbc.settings import NotEmpty, Range, SettingError, Settings, hints, read_partial
 from sb3_tbc.tbc_hrl.config import FlatConfig, HACConfig, HiTSConfig, TBCConfig
 
 CONFIG_CLASSES: dict[str, type[Settings]] = {
@@ -78,6 +81,27 @@ def validate(section: object, algo: str | None, where: str) -> Plain:
     :raises ConfigError: for an unknown key or a value that is not allowed
     """
     try:
-        return read_partial(section, kinds_of(algo))
+        checked = read_partial(section, kinds_of(algo))
+        _check_storable(checked.get("env_kwargs"), "env_kwargs")
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from None
+    return checked
+
+
+def _check_storable(value: object, name: str) -> None:
+    """Refuse what JSON cannot hold: a run's result, written after all training, and its agents name the arguments.
+
+    :raises SettingError: naming the argument
+    """
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if not isinstance(key, str):
+                raise SettingError(name, f"must have texts as keys, got {key!r}; put quotes around it")
+            _check_storable(item, f"{name}.{key}")
+    elif isinstance(value, list | tuple):
+        for index, item in enumerate(value):
+            _check_storable(item, f"{name}[{index}]")
+    elif not isinstance(value, str | int | float | None) or (isinstance(value, float) and not math.isfinite(value)):
+        allowed = "a finite number, text, true, false or null, or a list or section of these"
+        quotes = "; a date needs quotes" if isinstance(value, datetime.date) else ""
+        raise SettingError(name, f"must be {allowed}, got {value!r}{quotes}")

@@ -176,6 +176,24 @@ def test_order_default_task_tuned_command_line(tmp_path: Path) -> None:
     assert load_config("x", "AnotherEnv-v0", "paper", path=path).model["dt_min"] == 1
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ("env_kwargs.limit:.inf", r"env_kwargs\.limit must be a finite number, text, .*, got inf"),
+        ("env_kwargs.walls:[1, {x: .nan}]", r"env_kwargs\.walls\[1\]\.x must be a finite number, text, .*, got nan"),
+        ("env_kwargs.day:2026-01-02", r"env_kwargs\.day must be .*, got datetime.date\(2026, 1, 2\); a date needs quo"),
+        ("env_kwargs.set:{1: a}", r"env_kwargs\.set must have texts as keys, got 1; put quotes around it"),
+    ],
+)
+def test_arguments_that_a_result_cannot_hold_are_refused_at_once(tmp_path: Path, given: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=f"--hyperparams: {message}"):
+        parse_overrides([given])
+    path, (name, _, value) = tmp_path / "a.yml", given.partition(":")
+    path.write_text(f"T: {{n_timesteps: 10, env_kwargs: {{{name.partition('.')[2]}: {value}}}}}\n")
+    with pytest.raises(ConfigError, match=rf"a\.yml, section T: {message}"):
+        load_config("x", "T", path=path)
+
+
 def test_quoted_text_stays_text(tmp_path: Path) -> None:
     assert parse_overrides(['env_kwargs.map:"007"']) == {"env_kwargs": {"map": "007"}}
     assert parse_overrides(["env_kwargs.map:'3e-4'"]) == {"env_kwargs": {"map": "3e-4"}}
