@@ -92,9 +92,10 @@ def parse_actor(text: str) -> Actor:
         values = {"synapses": name, **dict(_circuit_option(o, text) for o in options)}
         return Actor(text, lambda skill, seed: conditioned(skill, seed, values), rates or CIRCUIT_RATES, factors,
                      optimizer)  # fmt: skip
-    if name == "mlp" and not options and all(w.isdigit() and int(w) > 0 for w in size.split("x") if size):
+    plain = not options and not factors
+    if name == "mlp" and plain and all(w.isdigit() and int(w) > 0 for w in size.split("x") if size):
         return Actor(text, lambda skill, seed: _make_mlp(skill, seed, size), rates or MLP_RATES, {}, optimizer)
-    if name == "gru" and not options and size.isdigit():
+    if name == "gru" and plain and size.isdigit() and int(size) > 0:
         return Actor(text, lambda skill, seed: _make_gru(skill, seed, int(size)), rates or MLP_RATES, {}, optimizer)
     raise ConfigError(f"no actor {text!r}: give paper or lean, mlp, mlp:24x14, mlp:1300 or gru:16, see --help")
 

@@ -22,6 +22,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from sb3_tbc.benchmark.actors import Actor, count, parse_actor
 from sb3_tbc.benchmark.conditioning import group_of
 from sb3_tbc.benchmark.skills import Skill, load_skill, skill_names
+from sb3_tbc.errors import ConfigError
 
 ROWS, SEQUENCES = 256, 32
 AVERAGE_DECAY = 0.995
@@ -157,6 +158,10 @@ def _clipped(gradients: Weights) -> Weights:
 
 def best_of(actor: Actor, skill: Skill, steps: Sequence[int], seeds: Sequence[int]) -> Result:
     """R2 at the best of the actor's rates, for every number of steps; means over seeds."""
+    try:
+        parameters = count(actor.make(skill, seeds[0]))
+    except ValueError as error:
+        raise ConfigError(f"actor {actor.name!r}: {error}") from error
     runs = [learn(actor, skill, steps, seed) for seed in seeds]
     found = {rate: {step: _mean([run[rate][step] for run in runs]) for step in steps} for rate in actor.rates}
 
@@ -166,7 +171,6 @@ def best_of(actor: Actor, skill: Skill, steps: Sequence[int], seeds: Sequence[in
 
     rates = {step: max(found, key=partial(order, step)) for step in steps}
     best = {step: found[rates[step]][step] for step in steps}
-    parameters = count(actor.make(skill, seeds[0]))
     later, learnt = ({step: fit[i] for step, fit in best.items()} for i in range(2))
     return Result(skill.name, actor.name, parameters, later, rates, learnt)
 

@@ -115,10 +115,10 @@ def robustness(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
 
     :raises ConfigError: if two agents were trained on different tasks
     """
+    given = [environment_of(Path(m), read_zip(Path(m)), arguments.trust)[0] for m in arguments.models]
+    if len(set(given)) > 1:
+        raise ConfigError(f"agents of different tasks cannot be compared, got {', '.join(given)}")
     tables = [measure(Path(m), arguments.n_episodes, arguments.seed, arguments.trust) for m in arguments.models]
-    titles = [[row.disturbance for row in table] for table in tables]
-    if any(other != titles[0] for other in titles):
-        raise ConfigError("agents of different tasks cannot be compared: their disturbances differ")
     lines = [f"agent {i}: {table[0].agent}" for i, table in enumerate(tables)]
     head = "".join(f"{f'success {i}':>11}{f'95 % {i}':>14}{f'rough {i}':>9}" for i in range(len(tables)))
     lines.append(f"{'disturbance':<20}{head}")

@@ -16,7 +16,7 @@ from sb3_tbc.evaluate import identify
 from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.interpret.drawing import picture_of
 from sb3_tbc.interpret.episodes import HeldOutEpisodes
-from sb3_tbc.interpret.features import space_of
+from sb3_tbc.interpret.features import TaskSpace, space_of
 from sb3_tbc.interpret.findings import Effort, Findings, investigate, to_plain
 from sb3_tbc.interpret.page import live_page
 from sb3_tbc.interpret.picture import activation_in_space, units_shown
@@ -25,6 +25,7 @@ from sb3_tbc.interpret.units import CircuitUnits, units_of
 from sb3_tbc.pretrained import model_path
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.algorithms import load_two_levels
+from sb3_tbc.zoo.environments import make_env
 from sb3_tbc.zoo.ledger import to_json
 from sb3_tbc.zoo.runner import HELD_OUT
 
@@ -68,7 +69,7 @@ def command(argv: Sequence[str]) -> int:
     th.set_num_threads(args.num_threads)
     info = identify(args.model, args.env, args.trust)
     model = load_two_levels(args.model, device=args.device, trust=args.trust)
-    units, space = units_of(model), space_of(info["task"], model.views.subgoals)
+    units, space = units_of(model), _space_of(model, info)
     if not isinstance(units, CircuitUnits) and (args.synapses or args.wiring):
         asked = "--synapses" if args.synapses else "--wiring"
         raise ConfigError(f"{asked} is about the synapses of a circuit; this agent's low level is an MLP")
@@ -83,9 +84,17 @@ def command(argv: Sequence[str]) -> int:
     return 0
 
 
+def _space_of(model: TBCHRL, info: Plain) -> TaskSpace:
+    """The task's own space if the agent's subgoals are the task's."""
+    env = make_env(info["env_id"], **info["env_kwargs"])
+    own = env.get_wrapper_attr("subgoals").names == model.views.subgoals.names
+    env.close()
+    return space_of(info["task"] if own else "", model.views.subgoals)
+
+
 def _write(args: argparse.Namespace, found: Findings, model: TBCHRL, info: Plain, episodes: HeldOutEpisodes) -> None:
     """Write the files that were asked for."""
-    space, subgoals = space_of(info["task"], model.views.subgoals), model.views.subgoals
+    space, subgoals = _space_of(model, info), model.views.subgoals
     identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}
     if args.json is not None:
         about = {**identity, "n_timesteps": int(model.num_timesteps), "first_episode_seed": args.seed}

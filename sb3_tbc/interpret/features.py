@@ -89,7 +89,11 @@ def space_of(task: str, subgoals: SubgoalSpace) -> TaskSpace:
     if task in SPACES:
         return SPACES[task]
     if subgoals.dim == 1:
-        return TaskSpace((subgoals.names[0], "step"), lambda p, _: np.stack([p[:, 0], np.arange(len(p))], axis=1))
+        return TaskSpace(
+            (subgoals.names[0], "step"),
+            lambda p, _: np.stack([p[:, 0], np.arange(len(p))], axis=1),
+            speed=lambda p, _: np.append(np.abs(np.diff(p[:, 0])), 0.0),
+        )
     return TaskSpace((subgoals.names[0], subgoals.names[1]), lambda point, _: point[:, :2])
 
 

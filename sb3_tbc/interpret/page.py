@@ -15,7 +15,7 @@ from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.export.policy import MLP, ExportedPolicy, extract
 from sb3_tbc.interpret.episodes import HeldOutEpisodes, Trace
-from sb3_tbc.interpret.features import TaskSpace, places_of
+from sb3_tbc.interpret.features import SPACES, TaskSpace, places_of
 from sb3_tbc.interpret.findings import Findings
 from sb3_tbc.interpret.names import action_names, input_names
 from sb3_tbc.interpret.recording import recorded_starts
@@ -98,7 +98,8 @@ def _means(found: Findings) -> FloatArray:
 def page_data(model: TBCHRL, found: Findings, space: TaskSpace, info: PlainMapping) -> Plain:
     """All numbers of the page but those of its episodes."""
     policy, units = extract(model, found.task), found.units
-    live = found.task if dict(info["env_kwargs"]) in SIMULATED.get(found.task, ()) else None
+    simulated = space == SPACES.get(found.task) and dict(info["env_kwargs"]) in SIMULATED.get(found.task, ())
+    live = found.task if simulated else None
     alone = [r for r in found.lesions if r.what == "alone"]
     return {
         "live": live,

@@ -28,7 +28,10 @@ class FrozenNDBC:
 
     def __init__(self, net: NDBCNet) -> None:
         if net.step_rule is not None and net.step_rule.half_step_check:
-            raise ValueError("a network with half_step_check has no frozen form: act through NDBCNet or turn it off")
+            raise ValueError(
+                "agents with two levels act from a frozen form of the circuit, which has no half_step_check: leave it "
+                "out of adaptive_step; NDBCNet itself and NDBCSAC take it"
+            )
         self.net, self.state_dim = net, net.state_dim
         conductance = isinstance(net.cell, ConductanceCell)
         self._advance = self._advance_conductance if conductance else self._advance_dissipative

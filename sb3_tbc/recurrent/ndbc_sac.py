@@ -298,7 +298,7 @@ class NDBCSAC(PlainAlgorithm, SAC):
         if self.num_timesteps < learning_starts:
             unit = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
         if action_noise is not None:
-            unit = unit + action_noise()
+            unit = unit.reshape(n_envs, -1) + action_noise().reshape(n_envs, -1)
         unit = np.clip(unit, -1.0, 1.0).astype(np.float32)
         self._state = memory, unit.reshape(n_envs, -1)
         return self.policy.unscale_action(unit.reshape(actions.shape)), unit

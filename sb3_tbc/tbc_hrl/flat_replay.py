@@ -91,6 +91,13 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
         super().add(obs, next_obs, action, reward, done, infos)
         self._current_ep_start[bad] = self.pos
 
+    def _compute_episode_length(self, env_idx: int) -> None:
+        """Note a finished episode, see SB3, which takes one that just fills the buffer for an empty one."""
+        fills = self._current_ep_start[env_idx] == self.pos
+        super()._compute_episode_length(env_idx)
+        if fills:
+            self.ep_length[:, env_idx] = self.buffer_size
+
     def parts(self) -> Arrays:
         """All that is stored, by name: views of whole arrays, ``(buffer_size, n_envs, ...)``."""
         held: Arrays = {name: getattr(self, name) for name in ARRAYS}

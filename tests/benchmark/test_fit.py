@@ -79,11 +79,17 @@ def test_actors_are_made_as_described() -> None:
 
 @pytest.mark.parametrize(
     "text", ["", "fat", "lean:3", "lean,inter", "lean,colour=3", "mlp:0x3", "mlp:axb", "gru", "mlp,full",
-             "lean,rate=fast", "mlp,rate=0", "lean,rate_motors=3", "mlp,optimizer=sgd"]
+             "lean,rate=fast", "mlp,rate=0", "lean,rate_motors=3", "mlp,optimizer=sgd", "mlp,rate_gains=3", "gru:0"]
 )  # fmt: skip
 def test_what_describes_no_actor_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="actor"):
         parse_actor(text)
+
+
+@pytest.mark.parametrize("text", ["paper,inter=0", "paper,readout=foo"])
+def test_a_circuit_that_cannot_be_made_is_refused_by_its_description(text: str) -> None:
+    with pytest.raises(ConfigError, match=f"actor '{text}': (inter|readout) must be "):
+        fit.best_of(parse_actor(text), load_skill("delay3"), [1], [0])
 
 
 def learn_alone(actor: actors.Actor, rate: float, skill: Skill, steps: int, seed: int) -> float:

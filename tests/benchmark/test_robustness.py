@@ -67,6 +67,7 @@ def test_the_command_prints_agents_side_by_side(few: None, capsys: Any, tmp_path
     assert [row["successes"] for row in rows[:half]] == [row["successes"] for row in rows[half:]]
 
 
-def test_agents_of_different_tasks_are_refused(few: None) -> None:
+@pytest.mark.parametrize("other", ["Drawbridge", "Tennis2D"])  # the second has the same names of quantities
+def test_agents_of_different_tasks_are_refused(other: str, few: None) -> None:
     with pytest.raises(ConfigError, match="different tasks"):
-        benchmark(["robustness", "pretrained:Pendulum", "pretrained:Drawbridge", "--n-episodes", "1"])
+        benchmark(["robustness", "pretrained:Pendulum", f"pretrained:{other}", "--n-episodes", "1"])

@@ -6,13 +6,15 @@ import json
 from pathlib import Path
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 
 import sb3_tbc
-from sb3_tbc import TBCHRL, evaluate
+from sb3_tbc import TBCHRL, SubgoalSpace, evaluate
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.interpret import command as interpret
+from sb3_tbc.interpret.features import space_of
 from sb3_tbc.pretrained import load_pretrained, pretrained_names, pretrained_path
 from sb3_tbc.zoo.algorithms import RUN_INFO, read_zip
 from sb3_tbc.zoo.environments import make_envs
@@ -127,3 +129,21 @@ def test_a_pretrained_agent_does_what_its_card_says(capsys: pytest.CaptureFixtur
     assert sb3_tbc.load_pretrained("Pendulum").num_timesteps == 100_000
     with pytest.raises(ConfigError, match="Drawbridge"):
         sb3_tbc.load_pretrained("Drawbrige")
+
+
+def test_subgoals_of_the_agents_own_are_what_is_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One coordinate in place of the task's two."""
+    angle = SubgoalSpace.from_slices(
+        [-3.2], [3.2], [0.2], achieved=[("achieved_goal", 0, 1)], local_scale=[1.0, 1.0, 8.0], names=["angle"]
+    )
+    path, page = saved(tmp_path, subgoals=angle), tmp_path / "page.html"
+    assert interpret.main([str(path), *SHORT, "--html", str(page), "--png", str(tmp_path / "o.png")]) == 0
+    assert "speed" in capsys.readouterr().out
+    assert '"live":null' in page.read_text(encoding="utf-8")
+
+
+def test_speed_along_one_coordinate() -> None:
+    space = space_of("", SubgoalSpace.from_slices([-1], [1], [0.1], local_scale=[1.0], names=["x"]))
+    assert space.speed is not None
+    points = np.array([[0.0], [0.5], [0.4], [1.0]])
+    np.testing.assert_allclose(space.speed(points, points)[:-1], [0.5, 0.1, 0.6])

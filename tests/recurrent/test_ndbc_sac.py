@@ -271,6 +271,23 @@ def test_an_adaptive_step_follows_the_weights(tmp_path: Path) -> None:
     assert NDBCSAC.load(tmp_path / "agent.zip").actor.features_extractor.cell.net.sub_steps == net.sub_steps
 
 
+class Row(gym.ActionWrapper[Any, Any, Any]):
+    """Its action is a matrix of one row."""
+
+    def __init__(self, env: Any) -> None:
+        super().__init__(env)
+        self.action_space = spaces.Box(-2.0, 2.0, (1, 2), np.float32)
+
+    def action(self, action: Any) -> Any:
+        return action[0, :1]
+
+
+def test_noise_has_the_shape_of_the_actions() -> None:
+    noise = NormalActionNoise(np.zeros((1, 2)), np.full((1, 2), 0.1))
+    model = make(env=make_vec_env(Recall, 2, wrapper_class=Row), action_noise=noise).learn(40)
+    assert model.predict(np.zeros((2, 2), np.float32))[0].shape == (2, 1, 2)
+
+
 def test_replay_fills_a_buffer_of_just_its_size(tmp_path: Path) -> None:
     made = make(buffer_size=100).learn(60)
     made.save_replay_buffer(tmp_path / "replay.npz")

@@ -279,3 +279,11 @@ def test_sb3s_callbacks_and_clear_refusals() -> None:
         model.learn("1000")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="got -5"):
         model.learn(-5)
+
+
+@pytest.mark.parametrize("size", [20, 21])
+def test_episodes_that_just_fill_the_buffer_are_learned_from(size: int) -> None:
+    model = FlatSAC("MultiInputPolicy", Corridor(20, goal=5.0), seed=0, buffer_size=size, batch_size=8)
+    model.learn(200)
+    assert model._n_updates == 100  # it begins after a hundred steps
+    assert set(model._her_buffer().ep_length.ravel()) <= {0, 20}
