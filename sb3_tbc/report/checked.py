@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 
 from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.errors import ConfigError
@@ -34,6 +35,22 @@ def check_final(final: PlainMapping) -> None:
             raise ConfigError(f"{name} must be a text, got {one_line(repr(final[name]), 100)}")
     if not re.fullmatch("[01]*", final.get("outcomes") or ""):
         raise ConfigError("outcomes must be a text of 0 and 1")
+
+
+def check_place(folder: Path, final: PlainMapping) -> None:
+    """Refuse a run that lies where another one belongs: a renamed copy would be counted as one more run.
+
+    :param folder: ``<task>/<algo>/<variant>/seed_<n>``
+    :param final: its ``final.json``
+    :raises ConfigError: naming the first difference, and the cure
+    """
+    for name, place in zip(("task", "algo", "variant", "seed"), folder.parts[-4:], strict=True):
+        said, place = str(final[name]), place.removeprefix("seed_") if name == "seed" else place
+        if (re.sub("[/:]", "_", said) if name == "task" else said) != place:
+            raise ConfigError(
+                f"its final.json is of {name} {one_line(repr(said), 100)}, but its folder of {place!r}; "
+                "rename the folder, or move it out of the ledger if it is a copy"
+            )
 
 
 def check_sections(data: PlainMapping, *names: str) -> None:

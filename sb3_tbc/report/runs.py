@@ -16,10 +16,10 @@ from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json, read_text, read_yaml
-from sb3_tbc.report.checked import check_final, check_sections
+from sb3_tbc.report.checked import check_final, check_place, check_sections
 from sb3_tbc.zoo.callbacks import EvaluationRow
 from sb3_tbc.zoo.config import OF_PAPER, merge
-from sb3_tbc.zoo.ledger import COMMAND, RESUMED, VERSIONS, RunFolder, finished_runs
+from sb3_tbc.zoo.ledger import COMMAND, RESUMED, VERSIONS, RunFolder, finished_runs, run_folders
 from sb3_tbc.zoo.schema import CONFIG_CLASSES
 
 OURS = "tbc-hrl"
@@ -167,6 +167,7 @@ def _reported(runs: Sequence[Run], chosen: Collection[int]) -> list[Run]:
 def _load(folder: RunFolder) -> Run:
     final = folder.read_final()
     check_final(final)
+    check_place(folder.path, final)
     config = folder.read_config() if folder.exists else {}
     command = _text(folder.path / COMMAND).strip()
     versions = read_json(folder.path / VERSIONS) if (folder.path / VERSIONS).is_file() else {}
@@ -189,7 +190,7 @@ def _rank(method: str) -> tuple[bool, str]:
 
 def failed_runs(root: Path) -> list[Path]:
     """Folders of runs that ended in an error, as ``reproduce`` marks them, and that have not been repeated since."""
-    return [p.parent for p in sorted(root.glob("*/*/*/seed_*/failed.json")) if not (p.parent / "final.json").is_file()]
+    return [folder.path for folder in run_folders(root, "failed.json") if not folder.finished]
 
 
 def is_shipped(method: str) -> bool:

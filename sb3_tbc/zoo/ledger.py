@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import platform
+import re
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -36,6 +37,7 @@ CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL = (
 )
 RESUMED = "resumed"
 """In ``versions.json``: the versions of a run's later parts, where they are not those before."""
+SEED_FOLDER = re.compile("seed_[0-9]+")
 LEDGER_FILES = (CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL)
 SOURCES = (":/sb3_tbc", ":/tasks", ":/zoo_configs")
 PACKAGES = (
@@ -323,7 +325,13 @@ def curve_summary(rows: list[EvaluationRow]) -> Plain:
     return {"best_success_rate": max(rates), "stable_share": share, "worst_after_first_90": worst}
 
 
+def run_folders(root: Path, file: str) -> Iterator[RunFolder]:
+    """Folders of runs that hold a file, in order of their paths; a copy such as ``seed_3 (copy)`` is none."""
+    for path in sorted(root.glob(f"*/*/*/seed_*/{file}")):
+        if SEED_FOLDER.fullmatch(path.parent.name):
+            yield RunFolder(path.parent)
+
+
 def finished_runs(root: Path) -> Iterator[RunFolder]:
     """All runs with a result below a folder, in order of their paths."""
-    for path in sorted(root.glob(f"*/*/*/seed_*/{FINAL}")):
-        yield RunFolder(path.parent)
+    return run_folders(root, FINAL)

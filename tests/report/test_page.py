@@ -119,16 +119,17 @@ def test_ticks_are_round(last: int, distance: int) -> None:
 
 def test_names_are_escaped_everywhere(tmp_path: Path) -> None:
     task, evil = "<img src=x>", "x\"><script>alert('&')</script>"
-    folder = tmp_path / "ledger" / "t" / "tbc-hrl" / "v" / "seed_0"
+    variant = evil.replace("/", "")  # its folder has the same name
+    folder = tmp_path / "ledger" / task / "tbc-hrl" / variant / "seed_0"
     made = fake_run(tmp_path / "other", "A", "tbc-hrl", 0, 0.5)
     folder.mkdir(parents=True)
     for file in made.path.iterdir():
         (folder / file.name).write_bytes(file.read_bytes())
-    final = {**made.read_final(), "task": task, "variant": evil}
+    final = {**made.read_final(), "task": task, "variant": variant}
     (folder / "final.json").write_text(json.dumps(final))
     (folder / "command.txt").write_text(evil)
     (folder / "versions.json").write_text(json.dumps({"commit": evil, "packages": {evil: evil}}))
-    (tmp_path / "ledger" / "descriptions.yml").write_text(yaml.safe_dump({task: {f"tbc-hrl {evil}": evil}}))
+    (tmp_path / "ledger" / "descriptions.yml").write_text(yaml.safe_dump({task: {f"tbc-hrl {variant}": evil}}))
     page = tmp_path / "page.html"
     assert report.main([str(tmp_path / "ledger"), "--html", str(page)]) == 0
     text = page.read_text()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,15 @@ from sb3_tbc.report.comparisons import (
 )
 from sb3_tbc.report.conditions import notes_of_row
 from sb3_tbc.report.paper import load_paper
-from sb3_tbc.report.runs import BEGIN_ALIKE, Curve, describe, load_descriptions, load_results, on_union_of_steps
+from sb3_tbc.report.runs import (
+    BEGIN_ALIKE,
+    Curve,
+    describe,
+    failed_runs,
+    load_descriptions,
+    load_results,
+    on_union_of_steps,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -39,6 +49,37 @@ def row_of(root: Path, method: str) -> dict[str, str]:
 def test_final_success_is_the_last_evaluation_not_the_best(tmp_path: Path) -> None:
     fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4, curve=[0.2, 1.0, 0.5, 0.4], best_success_rate=1.0)
     assert row_of(tmp_path, "tbc-hrl")["success"] == "0.400"
+
+
+def test_a_copy_of_a_run_is_not_counted_again(tmp_path: Path) -> None:
+    run = fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4).path
+    shutil.copytree(run, run.with_name("seed_0 (copy)"))
+    shutil.copytree(run, run.with_name("seed_old"))
+    (run.with_name("seed_0 (copy)") / "final.json").rename(run.with_name("seed_0 (copy)") / "failed.json")
+    assert row_of(tmp_path, "tbc-hrl")["seeds"] == "1"
+    assert failed_runs(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("place", "told"),
+    [
+        ("B/tbc-hrl/full/seed_0", "task 'A', but its folder of 'B'"),
+        ("A/hits/full/seed_0", "algo 'tbc-hrl', but its folder of 'hits'"),
+        ("A/tbc-hrl/full-old/seed_0", "variant 'full', but its folder of 'full-old'"),
+        ("A/tbc-hrl/full/seed_1", "seed '0', but its folder of '1'"),
+        ("A/tbc-hrl/full/seed_00", "seed '0', but its folder of '00'"),
+    ],
+)
+def test_a_run_in_the_place_of_another_is_refused(place: str, told: str, tmp_path: Path) -> None:
+    run = fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4).path
+    shutil.copytree(run, tmp_path / place)
+    with pytest.raises(ConfigError, match=re.escape(f"{place}: its final.json is of {told}; rename the folder, or")):
+        load_results(tmp_path)
+
+
+def test_an_environment_s_id_names_its_folder(tmp_path: Path) -> None:
+    fake_run(tmp_path, "my_module:ns/Env-v0", "tbc-hrl", 0, 0.4)
+    assert list(load_results(tmp_path)) == ["my_module:ns/Env-v0"]
 
 
 def test_worst_is_the_lowest_of_all_seeds_not_their_mean(tmp_path: Path) -> None:
