@@ -2,7 +2,7 @@
 
 Results go to the ledger. A stopped campaign is continued by the same command: finished runs are never repeated; failed
 ones are recorded in the ledger, counted, and tried again. A run in the log folder that was made with other settings is
-neither continued nor copied.
+neither continued nor copied; where the ledger has one, nothing begins.
 """
 
 from __future__ import annotations
@@ -158,11 +158,21 @@ def _slurm_settings(items: Sequence[str]) -> dict[str, object]:
     return {name: parse_yaml(value, f"--slurm {name}") for name, _, value in pairs}
 
 
+def _done(job: Job) -> bool:
+    """Whether the ledger has the run's result.
+
+    :raises ConfigError: if what it has there is another run's
+    """
+    if job.target.finished:
+        job.require_kept(wanted_run(job))
+    return job.target.finished
+
+
 def command(argv: Sequence[str]) -> int:
     """Reproduce; see ``--help``."""
     args = build_parser().parse_args(argv)
     planned = list(jobs(argv))
-    todo = [job for job in planned if not job.target.finished]
+    todo = [job for job in planned if not _done(job)]
     print(f"{len(planned)} runs, {len(planned) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
     if args.dry_run:
         print("\n".join(plan(todo, args.workers, read_speeds(args.ledger), lambda job: job.name)))

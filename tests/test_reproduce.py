@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from sb3_tbc import reproduce
+from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.zoo.ledger import LEDGER_FILES, RunFolder
 
 TINY = [
@@ -59,15 +60,46 @@ def test_all_ablations_in_one_command(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 def test_finished_runs_are_not_repeated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    done = RunFolder.for_run(tmp_path / "results", "Pendulum", "hits", "full", 0)
-    done.path.mkdir(parents=True)
-    for name in LEDGER_FILES:
-        (done.path / name).write_text("{}")
+    keep_result(next(iter(reproduce.jobs(campaign(tmp_path)))))
     assert reproduce.main(campaign(tmp_path, "--dry-run")) == 0
     out = capsys.readouterr().out
     assert "4 runs, 1 of them in" in out
     assert "hits full seed 0" not in out
     assert "hits full seed 1" in out
+
+
+def keep_result(job: Job) -> None:
+    job.target.start(reproduce.wanted_run(job).to_dict(), "x")
+    job.target.finish({"success_rate": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        (["--n-timesteps", "1000"], "n_timesteps is 200000 there, not 1000"),
+        (["--n-eval-episodes", "3"], "n_eval_episodes is 20 there, not 3"),
+        (["--variant", "full", "--hyperparams", "low.gamma:0.5"], "model.low.gamma is 0.99 there, not 0.5"),
+    ],
+)
+def test_a_run_of_the_ledger_with_other_settings_is_not_done(
+    asked: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first = next(iter(reproduce.jobs(campaign(tmp_path))))
+    keep_result(first)
+    for more in ([], ["--dry-run"]):
+        assert reproduce.main(campaign(tmp_path, *asked, *more)) == 2
+        said = capsys.readouterr()
+        assert f"{first.target.path} holds another run: {told}; ask for that run with the same options" in said.err
+        assert said.out == ""
+    assert not (tmp_path / "runs").exists()
+
+
+def test_half_a_result_in_the_ledger_is_not_done(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = next(iter(reproduce.jobs(campaign(tmp_path))))
+    keep_result(first)
+    (first.target.path / "final.json").write_text('{"success')
+    assert reproduce.main(campaign(tmp_path, "--dry-run")) == 2
+    assert "final.json: it is no JSON" in capsys.readouterr().err
 
 
 def test_an_interrupted_run_is_resumed(tmp_path: Path) -> None:

@@ -78,11 +78,18 @@ class Job:
         :param wanted: what the folder must hold
         :raises ConfigError: naming the first difference, or if the folder's configuration cannot be read
         """
-        found = RunSpec.from_dict(self.folder.read_config()).to_dict()
-        asked = yaml.safe_load(yaml.safe_dump(wanted.to_dict(), sort_keys=False))  # as the folder has it
-        if difference := first_difference(asked, found):
-            cure = "use another --log-folder, or replace that run with sb3_tbc.train --overwrite"
-            raise ConfigError(f"{self.folder.path} holds another run: {difference}; {cure}")
+        cure = "use another --log-folder, or replace that run with sb3_tbc.train --overwrite"
+        _require_run(self.folder, wanted, cure)
+
+    def require_kept(self, wanted: RunSpec) -> None:
+        """Refuse a result in the ledger that is another run's, or that cannot be read: this run is not done by it.
+
+        :param wanted: the run whose result it must be
+        :raises ConfigError: naming the first difference or the file
+        """
+        cure = "ask for that run with the same options, use another --variant or --ledger, or move it out of the ledger"
+        _require_run(self.target, wanted, cure)
+        self.target.read_final()
 
     def keep_result(self) -> None:
         """Copy the result into the ledger, if it is not there yet, and forget earlier failures.
@@ -114,6 +121,13 @@ class Job:
         attempts = _attempts(record)
         row = {"task": self.env, "algo": self.algo, "variant": self.variant, "seed": self.seed}
         write_atomic(record, to_json({**row, "exit_status": status, "attempts": attempts + 1, "message": message}))
+
+
+def _require_run(folder: RunFolder, wanted: RunSpec, cure: str) -> None:
+    found = RunSpec.from_dict(folder.read_config()).to_dict()
+    asked = yaml.safe_load(yaml.safe_dump(wanted.to_dict(), sort_keys=False))  # as the folder has it
+    if difference := first_difference(asked, found):
+        raise ConfigError(f"{folder.path} holds another run: {difference}; {cure}")
 
 
 def first_difference(asked: Plain, found: Plain, section: str = "") -> str:
