@@ -15,6 +15,7 @@ ABLATION_CLAIMS = {
     f"{OURS} no-ndbc": ("needs the circuit where space is complex", SPATIAL_TASKS),
 }
 HOLDS, SAME, OPPOSITE = "holds", "no difference shown", "the opposite"
+SOONER = {True: "yes", False: "no", None: "not decided: too few steps"}
 
 
 class Claim(NamedTuple):
@@ -65,7 +66,7 @@ def _sooner(results: Results) -> list[Claim]:
     for row in against_baselines(results):
         if row.strongest and row.gain is not None:
             said = f"steps saved to {row.gain.threshold:.2f}: {row.gain}, against {row.other} (mean curves, no test)"
-            found.append(Claim(text, row.task, "yes" if row.gain.ahead else "no", said))
+            found.append(Claim(text, row.task, SOONER[row.gain.ahead], said))
     return found
 
 

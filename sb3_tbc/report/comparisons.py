@@ -33,19 +33,31 @@ class Gain(NamedTuple):
     threshold: float
     ours: int | None
     theirs: int | None
-    until: int  # steps that the other method was trained for
+    until: int  # where the other method's mean curve ends
+    ours_until: int  # where ours ends
 
     @property
-    def ahead(self) -> bool:
-        """Whether ours reaches the threshold first."""
-        return self.ours is not None and (self.theirs is None or self.ours < self.theirs)
+    def ahead(self) -> bool | None:
+        """Whether ours reaches the threshold first; ``None`` if one side was trained for too few steps to tell.
+
+        A curve that ends before the other one is at the threshold might have been there first.
+        """
+        if self.ours is not None and self.theirs is not None:
+            return self.ours < self.theirs
+        if self.ours is not None:
+            return True if self.until >= self.ours else None
+        return None if self.theirs is not None and self.ours_until < self.theirs else False
 
     def __str__(self) -> str:
         if self.ours is not None and self.theirs is not None:
             return f"{self.theirs - self.ours:,}"
         if self.ours is not None:
-            return f"not reached in {self.until:,}"
-        return "ours does not reach it" if self.theirs is not None else "-"
+            short = f"trained for {self.until:,} only, ours needs {self.ours:,}"
+            return short if self.ahead is None else f"not reached in {self.until:,}"
+        if self.theirs is not None:
+            short = f"ours was trained for {self.ours_until:,} only, the other needs {self.theirs:,}"
+            return short if self.ahead is None else "ours does not reach it"
+        return "-"
 
 
 class Row(NamedTuple):
@@ -111,7 +123,7 @@ def convergence_gain(ours: Sequence[Run], theirs: Sequence[Run], threshold: floa
     if threshold is None or curves[0] is None or curves[1] is None:
         return None
     ours_at, theirs_at = stats.steps_to(*curves[0], threshold), stats.steps_to(*curves[1], threshold)
-    return Gain(threshold, ours_at, theirs_at, max(run.rows[-1].timesteps for run in theirs if run.rows))
+    return Gain(threshold, ours_at, theirs_at, until=curves[1][0][-1], ours_until=curves[0][0][-1])
 
 
 def baselines(methods: Mapping[str, Sequence[Run]]) -> list[str]:

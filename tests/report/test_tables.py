@@ -162,6 +162,37 @@ def test_a_method_that_never_learns_meets_no_threshold(tmp_path: Path) -> None:
     assert common_threshold(load_results(tmp_path)["B"]) is None  # nobody converges: no gain is reported
 
 
+@pytest.mark.parametrize(
+    ("ours", "theirs", "said", "verdict"),
+    [
+        ([0, 0, 0, 1], [0, 0], "trained for 2,000 only, ours needs 4,000", "not decided: too few steps"),
+        ([0, 1, 1, 1], [0, 0], "not reached in 2,000", "yes"),
+        ([0, 0, 0, 1], [0, 1], "-2,000", "no"),
+        ([0, 0], [0, 0, 1, 1], "ours was trained for 2,000 only, the other needs 3,000", "not decided: too few steps"),
+        ([0, 0, 0], [0, 0, 1, 1], "ours does not reach it", "no"),
+    ],
+)
+def test_a_curve_that_ends_early_proves_no_delay(
+    ours: list[float], theirs: list[float], said: str, verdict: str, tmp_path: Path
+) -> None:
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0, curve=ours)
+    fake_run(tmp_path, "A", "hits", 0, 1.0, curve=theirs)
+    (row,) = against_baselines(load_results(tmp_path))
+    assert str(row.gain) == said
+    (claim,) = [claim for claim in claims(load_results(tmp_path)) if "common threshold" in claim.text]
+    assert claim.verdict == verdict
+    assert f"{said}, against hits" in claim.evidence
+
+
+def test_a_threshold_is_not_reached_in_the_steps_of_the_shortest_seed(tmp_path: Path) -> None:
+    """The mean curve ends there; longer seeds tell nothing of the mean beyond."""
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0, curve=[1.0, 1.0, 1.0, 1.0])
+    fake_run(tmp_path, "A", "hits", 0, 0.0, curve=[0.0, 0.0])
+    fake_run(tmp_path, "A", "hits", 1, 0.0, curve=[0.0, 0.0, 0.0, 0.0])
+    (row,) = against_baselines(load_results(tmp_path))
+    assert str(row.gain) == "not reached in 2,000"
+
+
 def test_comparisons_are_tested_over_seeds_and_corrected_together(tmp_path: Path) -> None:
     for seed, noise in enumerate((0.0, 0.01, 0.02)):
         fake_run(tmp_path, "A", "tbc-hrl", seed, 0.95 + noise)
