@@ -17,6 +17,7 @@ import yaml
 
 from sb3_tbc import __main__, evaluate, train
 from sb3_tbc.zoo.algorithms import load_model
+from sb3_tbc.zoo.callbacks import write_evaluations
 from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.ledger import RunFolder
 
@@ -255,6 +256,47 @@ def test_resume_without_a_checkpoint(run: RunFolder, tmp_path: Path, capsys: pyt
     shutil.rmtree(copy.checkpoint)
     assert train.main(["--resume", str(copy.path), "--n-timesteps", "600"]) == 2
     assert "has no checkpoint" in said(capsys)
+
+
+def test_an_extended_run_cannot_end_where_it_was_before(
+    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The folder still has the agent of the first end, which is not that of the checkpoint."""
+    from sb3_tbc.zoo.callbacks import SuccessEvalCallback
+
+    original = SuccessEvalCallback._on_step
+
+    def interrupt(self: SuccessEvalCallback) -> bool:
+        if self.num_timesteps == 650:
+            signal.raise_signal(signal.SIGINT)
+        return original(self)
+
+    copy = RunFolder(tmp_path / "seed_5")
+    shutil.copytree(run.path, copy.path)
+    monkeypatch.setattr(SuccessEvalCallback, "_on_step", interrupt)
+    assert train.main(["--resume", str(copy.path), "--n-timesteps", "2000", "--no-progress"]) == 130
+    monkeypatch.setattr(SuccessEvalCallback, "_on_step", original)
+    capsys.readouterr()
+    steps = json.loads((copy.checkpoint / "state.json").read_text())["timesteps"]
+    assert train.main(["--resume", str(copy.path), "--n-timesteps", "400", "--no-progress"]) == 2
+    assert f"is at {steps} of 400 steps already; raise --n-timesteps" in said(capsys)
+    assert not copy.finished
+    assert copy.checkpoint.is_dir()
+    assert train.main(["--resume", str(copy.path), "--n-timesteps", str(steps), "--no-progress"]) == 0
+    assert copy.read_final()["n_timesteps"] == copy.read_config()["n_timesteps"] == steps
+
+
+def test_an_extended_run_may_go_back_to_its_first_end(run: RunFolder, tmp_path: Path) -> None:
+    """It was killed before its next checkpoint: what it had written beyond the first end goes."""
+    copy = RunFolder(tmp_path / "seed_5")
+    shutil.copytree(run.path, copy.path)
+    copy.reopen(400)
+    copy.start({**copy.read_config(), "n_timesteps": 2000}, "")
+    rows = run.read_evaluations()
+    write_evaluations(copy.evaluations, [*rows, rows[-1]._replace(timesteps=600)])
+    assert train.main(["--resume", str(copy.path), "--n-timesteps", "400", "--no-progress"]) == 0
+    assert copy.read_final()["n_timesteps"] == copy.read_config()["n_timesteps"] == 400
+    assert copy.read_evaluations() == rows
 
 
 def test_ctrl_c_saves_and_resume_finishes(

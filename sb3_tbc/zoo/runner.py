@@ -201,17 +201,18 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
     :raises TrainingError: if an environment fails or learning diverges
     """
     spec = RunSpec.from_dict(folder.read_config())
-    if folder.finished and n_timesteps in (None, spec.run.n_timesteps):
+    changed = n_timesteps is not None and n_timesteps != spec.run.n_timesteps
+    if folder.finished and not changed:
         return folder.read_final()
-    command = "" if n_timesteps in (None, spec.run.n_timesteps) else command
     if n_timesteps is not None:
         spec = replace(spec, run=replace(spec.run, n_timesteps=n_timesteps))
     with locked(folder.path):
         with explained(folder.path):
             folder.tidy()
-        if not folder.finished and _trained(folder) >= spec.run.n_timesteps:
+        # with another total, the agent at the end of training may be that of an earlier part, before the checkpoint
+        if not folder.finished and not changed and _trained(folder) >= spec.run.n_timesteps:
             return _only_evaluate(spec, folder, options)
-        return _go_on(spec, folder, options, command)
+        return _go_on(spec, folder, options, command if changed else "")
 
 
 def _trained(folder: RunFolder) -> int:
