@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -75,17 +76,45 @@ def _mean_length(folder: RunFolder) -> float | None:
 
 
 def hours_of(job: Job, speeds: Speeds) -> float | None:
-    """Hours that a run takes; ``None`` if nothing is known of its task."""
+    """Hours that a run takes, see :func:`without_evaluations`; ``None`` if nothing is known of its task."""
+    key = _measured(job, speeds)
+    if key is not None:
+        evaluated = job.n_episodes * _episode(job, speeds) / speeds.evaluate[key]
+        return (job.n_timesteps / speeds.train[key] + evaluated) / 3600
+    speed = _of_task(job, speeds.whole)
+    return job.n_timesteps / speed / 3600 if speed else None
+
+
+def without_evaluations(job: Job, speeds: Speeds) -> bool:
+    """Whether a run's hours lack its evaluations, because no finished run tells how long their episodes are."""
+    return bool(job.n_episodes and _measured(job, speeds) and not _episode(job, speeds))
+
+
+def _measured(job: Job, speeds: Speeds) -> tuple[str, str] | None:
+    """The row of the measured speeds that is nearest to a run."""
     task, _ = resolve_env(job.env)
     of_paper = [f"{job.algo} full{OF_PAPER}"] if job.variant.endswith(OF_PAPER) else []
     methods = [f"{job.algo} {job.variant}", *of_paper, job.algo]
-    key = next(((task, method) for method in methods if (task, method) in speeds.train), None)
-    if key is not None:
-        length = speeds.episode.get((task, job.algo)) or speeds.episode.get((task, "")) or 0.0
-        seconds = job.n_timesteps / speeds.train[key] + job.n_episodes * length / speeds.evaluate[key]
-        return seconds / 3600
-    speed = speeds.whole.get((task, job.algo)) or speeds.whole.get((task, ""))
-    return job.n_timesteps / speed / 3600 if speed else None
+    return next(((task, method) for method in methods if (task, method) in speeds.train), None)
+
+
+def _episode(job: Job, speeds: Speeds) -> float:
+    """Mean steps of an evaluated episode, 0 if it is unknown."""
+    return _of_task(job, speeds.episode) or 0.0
+
+
+def _of_task(job: Job, rows: Rows) -> float | None:
+    """A figure of the run's method, or else of its task."""
+    task, _ = resolve_env(job.env)
+    return rows.get((task, job.algo)) or rows.get((task, ""))
+
+
+def hours_together(hours: Sequence[float], workers: int) -> float:
+    """Hours until the last of several runs ends, of which ``workers`` are carried out at a time, in this order."""
+    ends = [0.0] * workers
+    for each in hours:
+        heapq.heapreplace(ends, ends[0] + each)  # it begins when the first of those at work ends
+    return max(ends)
 
 
 def plan(todo: Sequence[Job], workers: int, speeds: Speeds, name: Callable[[Job], str]) -> list[str]:
@@ -96,7 +125,9 @@ def plan(todo: Sequence[Job], workers: int, speeds: Speeds, name: Callable[[Job]
         for job, h in zip(todo, hours, strict=True)
     ]
     known = [h for h in hours if h is not None]
+    bare = sum(without_evaluations(job, speeds) for job in todo)
     total = f"{len(todo)} runs, {sum(known):.1f} hours of one core at measured speeds, evaluations included"
-    total += f"; about {sum(known) / workers:.1f} hours with {workers} at a time" if workers > 1 else ""
+    total += f" except those of {bare} runs, whose episodes' length is unknown" if bare else ""
+    total += f"; about {hours_together(known, workers):.1f} hours with {workers} at a time" if workers > 1 else ""
     unknown = len(hours) - len(known)
     return [*lines, total + (f"; {unknown} runs of unknown length" if unknown else "")]

@@ -20,7 +20,7 @@ from rich.console import Console
 from sb3_tbc.campaign import campaign as campaigns
 from sb3_tbc.campaign.campaign import Campaign
 from sb3_tbc.campaign.executors import LocalExecutor, SlurmExecutor, run_job
-from sb3_tbc.campaign.hours import hours_of, plan, read_speeds
+from sb3_tbc.campaign.hours import Speeds, hours_of, hours_together, plan, read_speeds
 from sb3_tbc.campaign.jobs import FAILED, Job
 from sb3_tbc.campaign.progress import Board
 from sb3_tbc.errors import ConfigError
@@ -420,6 +420,37 @@ def test_hours_from_finished_runs(tmp_path: Path) -> None:
     assert lines[1].endswith("hours unknown")
     assert "with 2 at a time" in lines[2]
     assert lines[2].endswith("1 runs of unknown length")
+
+
+@pytest.mark.parametrize(
+    ("hours", "workers", "whole"),
+    [
+        ([1.0, 1.0], 40, 1.0),
+        ([1.0, *[0.01] * 9], 5, 1.0),
+        ([*[0.5] * 3, 1.0], 2, 1.5),
+        ([], 3, 0.0),
+        ([1.0, 2.0], 1, 3.0),
+    ],
+)
+def test_the_last_run_ends_when_its_turn_is_over(hours: list[float], workers: int, whole: float) -> None:
+    assert hours_together(hours, workers) == pytest.approx(whole)
+
+
+def test_a_plan_waits_for_its_longest_run(tmp_path: Path) -> None:
+    speeds = Speeds({}, {}, {}, {("Pendulum", ""): 1000 / 3600})
+    plans = plan([make_job(tmp_path), make_job(tmp_path, 1)], 40, speeds, lambda job: job.name)
+    assert "2.0 hours of one core at measured speeds, evaluations included; about 1.0 hours with 40" in plans[-1]
+
+
+def test_hours_without_evaluations_are_not_said_to_include_them(tmp_path: Path) -> None:
+    rows = {("Pendulum", "hits"): 1000 / 3600}
+    job = replace(make_job(tmp_path), n_episodes=100)
+    (_, last) = plan([job], 1, Speeds(rows, rows, {}, {}), lambda job: job.name)
+    assert last.endswith("1.0 hours of one core at measured speeds, evaluations included except those of 1 runs, whose "
+        "episodes' length is unknown")  # fmt: skip
+    for known, planned in (({("Pendulum", ""): 5.0}, job), ({}, replace(job, n_episodes=0))):
+        (_, last) = plan([planned], 1, Speeds(rows, rows, known, {}), lambda job: job.name)
+        assert last.endswith("evaluations included")
 
 
 def test_hours_from_measured_speeds_with_evaluations(tmp_path: Path) -> None:
