@@ -237,12 +237,25 @@ def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> 
     if args.resume is not None:
         _refuse_settings(argv)
         folder = RunFolder(args.resume)
+        if args.ledger is not None:
+            _require_place(args.ledger, folder, RunSpec.from_dict(folder.read_config()))
         return folder, resume_run(folder, options, args.n_timesteps, line)
     spec = build_spec(args)
     folder = RunFolder.for_run(args.log_folder, spec.run.task, spec.run.algo, spec.variant, spec.seed)
     if args.ledger is not None:
-        _ledger_folder(args.ledger, spec.identity).require_empty()
+        _require_place(args.ledger, folder, spec)
     return folder, start_run(spec, folder, line, options, args.overwrite)
+
+
+def _require_place(ledger: Path, folder: RunFolder, spec: RunSpec) -> None:
+    """Refuse, before anything is trained, a ledger that could not take the result.
+
+    :raises ConfigError: if it is the folder of the runs itself, or holds such a result
+    """
+    target = _ledger_folder(ledger, spec.identity)
+    if target.path.resolve() == folder.path.resolve():
+        raise ConfigError(f"--ledger {ledger} is the folder of the runs itself; name another one, e.g. results")
+    target.require_empty()
 
 
 def _refuse_settings(argv: Sequence[str]) -> None:

@@ -244,6 +244,29 @@ def test_every_option_is_a_setting_of_the_run_or_one_of_how_it_is_carried_out() 
     assert set(vars(train.build_parser().parse_args([]))) - {"list"} == of_how | set(train.NOT_RESUMED)
 
 
+def test_a_ledger_that_cannot_take_the_result_is_told_before_training(
+    run: RunFolder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, ledger = tmp_path / "runs", tmp_path / "results"
+    copy = RunFolder(root / run.path.relative_to(run.path.parents[3]))
+    shutil.copytree(run.path, copy.path)
+    monkeypatch.chdir(tmp_path)
+
+    def trained(*_: Any, **__: Any) -> None:
+        raise AssertionError("it was trained")
+
+    monkeypatch.setattr(train, "resume_run", trained)
+    monkeypatch.setattr(train, "start_run", trained)
+    resume = ["--resume", str(copy.path), "--n-timesteps", "600", "--no-progress"]
+    fresh = ["--n-timesteps", "600", "--log-folder", "runs", "--seed", "6", *SHORT, *TINY]
+    for arguments, place in ((resume, str(root)), (fresh, str(root)), (fresh, "./runs")):
+        assert train.main([*arguments, "--ledger", place]) == 2
+        assert f"--ledger {Path(place)} is the folder of the runs itself; name another one" in said(capsys)
+    copy.copy_to(RunFolder.for_run(ledger, "Pendulum", "tbc-hrl", "custom", 5))
+    assert train.main([*resume, "--ledger", str(ledger)]) == 2
+    assert "already holds a result; remove it first" in said(capsys)
+
+
 def test_resume_without_a_checkpoint(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert train.main(["--resume", str(tmp_path)]) == 2
     assert "holds no run" in said(capsys)

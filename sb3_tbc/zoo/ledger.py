@@ -298,11 +298,16 @@ class RunFolder:
     def copy_to(self, target: RunFolder) -> None:
         """Copy the small text files, e.g. into the committed ledger.
 
-        :raises ConfigError: if it already holds a result, or one of the files is missing here
+        :raises ConfigError: if it already holds a result, or one of the files is missing here or cannot be read
         """
         target.require_empty()
         if missing := [name for name in LEDGER_FILES if not (self.path / name).is_file()]:
             raise ConfigError(f"{self.path} lacks {missing[0]} and cannot be copied; train it again with --overwrite")
+        for read in (self.read_config, self.read_final):  # what half a file says would count as the result
+            try:
+                read()
+            except ConfigError as error:
+                raise ConfigError(f"{error}; nothing was copied. Train the run again with --overwrite") from error
         for name in LEDGER_FILES:
             write_atomic(target.path / name, (self.path / name).read_text(encoding="utf-8"))
 

@@ -92,6 +92,17 @@ def test_a_run_without_evaluations_is_copied_whole_or_not_at_all(tmp_path: Path)
     assert not other.path.exists()
 
 
+@pytest.mark.parametrize("name", ["final.json", "config.yml"])
+def test_half_a_file_is_not_copied(name: str, tmp_path: Path) -> None:
+    folder, target = (RunFolder.for_run(tmp_path / root, "T", "a", "full", 0) for root in ("runs", "results"))
+    folder.start({"algo": "a"}, "python -m x")
+    folder.finish({"success_rate": 1.0})
+    (folder.path / name).write_text('{"success_')
+    with pytest.raises(ConfigError, match=rf"{name}: it is no .*; nothing was copied\. Train the run again"):
+        folder.copy_to(target)
+    assert not target.path.exists()
+
+
 def test_a_resumed_run_keeps_its_first_versions_and_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = RunFolder(tmp_path)
     commits = iter(("one", "one", "two", "two", "one"))
