@@ -29,13 +29,21 @@ LOCK = ".lock"
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's content, or a folder's list of names, is on the disk."""
-    with contextlib.suppress(PermissionError):  # Windows cannot open folders
-        handle = os.open(path, os.O_RDONLY)
+    """Wait until a file's content, or a folder's list of names, is on the disk.
+
+    Of a folder, only trouble of the disk itself is an error: Windows cannot open folders, some file systems not sync
+    them.
+    """
+    folder = path.is_dir()
+    try:
+        handle = os.open(path, os.O_RDONLY if folder else os.O_RDWR)  # Windows syncs only what may be written
         try:
             os.fsync(handle)
         finally:
             os.close(handle)
+    except OSError as error:
+        if not folder or error.errno in (errno.EIO, *FULL):
+            raise
 
 
 @contextlib.contextmanager
@@ -83,11 +91,13 @@ def temporary_beside(path: Path) -> Path:
 def replacing(path: Path) -> Iterator[Path]:
     """Give a temporary path beside ``path``; the file written there replaces ``path`` if the block ends without error.
 
-    The content is on the disk before the file gets its name, and the name is on the disk when the block is left.
+    The content is on the disk before the file gets its name, and the name is on the disk when the block is left. Of a
+    symbolic link, the file that it leads to is replaced.
 
     :raises WriteError: if the file cannot be written; what was at ``path`` is then untouched
     """
     with explained(path):
+        path = Path(os.path.realpath(path)) if path.is_symlink() else path
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = temporary_beside(path)
         try:

@@ -33,20 +33,21 @@ def push_to_hub(
 
     :param agent: an agent, or a ``.zip`` that one was saved to
     :param repo_id: ``"owner/name"``
-    :param filename: name of the ``.zip`` in the repository
+    :param filename: name of the ``.zip`` in the repository; slashes lead into folders, which are made
     :param card: model card in Markdown; by default the ``.md`` file beside a ``.zip``, as the package's own agents
         have one, else one line
     :param commit_message: what the repository's history says
     :param token: of your account; by default that of ``huggingface-cli login``
     :param private: whether a new repository is yours alone to see
     :return: address of the commit
-    :raises ConfigError: if the file does not exist, or the Hub refuses or cannot be reached
+    :raises ConfigError: if the file does not exist, ``filename`` leads out of the repository, or the Hub refuses or
+        cannot be reached
     """
     # Not huggingface_sb3.push_to_hub: it finds files of the current folder alone, and empties the model card.
     api = require("huggingface_sb3.push_to_hub", extra="hub", what="pushing to the Hub").HfApi()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        own_card = _gather(agent, folder / filename)
+        own_card = _gather(agent, _inside(folder, filename))
         text = own_card if card is None else card
         (folder / CARD).write_text(text if text.startswith("---") else HEAD + text, encoding="utf-8")
         try:
@@ -55,6 +56,15 @@ def push_to_hub(
         except Exception as error:  # requests, huggingface_hub and the Hub itself each have their own kinds
             raise ConfigError(f"cannot push to {repo_id} on the Hub: {one_line(error, 300)}") from error
     return str(done)
+
+
+def _inside(folder: Path, filename: str) -> Path:
+    """The place of a file in a folder; the folders between are made."""
+    path = folder / filename
+    if not path.resolve().is_relative_to(folder.resolve()):
+        raise ConfigError(f"filename must lie in the repository, as pendulum/model.zip; got {filename!r}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def _gather(agent: BaseAlgorithm | Path | str, target: Path) -> str:

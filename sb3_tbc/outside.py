@@ -11,6 +11,8 @@ MAX_NAME = 150
 """Longest name of a folder, in bytes; file systems allow 255, and files in it get suffixes."""
 SECRET = re.compile(r"((?:pass\w*|pwd|secret|token|key)\s*(?:=|%3d|:))[^&]*", re.IGNORECASE)
 HIDDEN = "***"
+DEVICES = re.compile(r"(con|prn|aux|nul|conin\$|conout\$|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE | re.DOTALL)
+"""Names that Windows keeps for devices, in either case and with any suffix."""
 
 
 def folder_name(text: str, what: str) -> str:
@@ -28,6 +30,8 @@ def folder_name(text: str, what: str) -> str:
             f"{what} must be a name for a folder: letters, digits, and - _ . = + inside; got {text!r}"
             + (f" with {bad[0]!r}" if bad else "")
         )
+    if DEVICES.fullmatch(text):
+        raise ConfigError(f"{what} must not be a name that Windows keeps for a device, as con or com1; got {text!r}")
     if len(text.encode()) > MAX_NAME:
         raise ConfigError(f"{what} must be at most {MAX_NAME} bytes long, got {len(text.encode())}")
     return text

@@ -45,7 +45,9 @@ def read_text(path: Path, most: int = MAX_BYTES) -> str:
     except FileNotFoundError as error:
         raise ConfigError(f"cannot read {path}: there is no such file") from error
     except UnicodeDecodeError as error:
-        raise ConfigError(f"cannot read {path}: it is no UTF-8 text ({error.reason} at byte {error.start})") from error
+        raise ConfigError(
+            f"cannot read {path}: it is no UTF-8 text ({error.reason} at byte {error.start}); save it as such"
+        ) from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"cannot read {path}: {one_line(error)}") from error
 

@@ -123,12 +123,29 @@ except Exception as error:
     assert hub.files["README.md"].decode().endswith("---\n# Mine")
 
 
+def test_an_agent_may_lie_in_a_folder_of_the_repository(hub: type[Handler]) -> None:
+    code = """
+from stable_baselines3 import PPO
+from sb3_tbc import push_to_hub
+from sb3_tbc.pretrained import pretrained_path
+push_to_hub(pretrained_path("Pendulum"), "owner/agent", "pendulum/model.zip")
+push_to_hub(PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8), "owner/agent", "others/ppo.zip")
+print("pushed")
+"""
+    assert run(code) == "pushed"
+    assert set(hub.files) == {"pendulum/model.zip", "others/ppo.zip", "README.md"}
+
+
 @pytest.mark.parametrize(
     ("code", "said"),
     [
         ("load_from_hub('owner/agent', 'none.zip')", "ConfigError: cannot download none.zip of owner/agent"),
         ("load_from_hub('no such name')", "ConfigError: cannot download model.zip of no such name"),
         ("push_to_hub('nothing.zip', 'owner/agent')", "ConfigError: no such file: nothing.zip"),
+        (
+            "push_to_hub('nothing.zip', 'owner/agent', '../model.zip')",
+            "ConfigError: filename must lie in the repository",
+        ),
         ("push_to_hub(pretrained_path('Pendulum'), 'owner/refused', token='x')", "ConfigError: cannot push to owner/"),
     ],
 )

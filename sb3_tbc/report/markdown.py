@@ -8,6 +8,7 @@ from pathlib import Path
 
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_atomic
+from sb3_tbc.reading import read_text
 from sb3_tbc.report import tables
 from sb3_tbc.report.runs import Results
 from sb3_tbc.report.sections import Report, sections
@@ -32,12 +33,9 @@ def _said(note: str) -> str:
 def update_page(path: Path, text: str) -> None:
     """Replace the text between the result marks of a Markdown page.
 
-    :raises ConfigError: if the page or its marks are missing
+    :raises ConfigError: if the page or its marks are missing, or it is no UTF-8
     """
-    try:
-        page = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error}") from error
+    page = read_text(path)
     before, begin, rest = page.partition(MARKS[0])
     _, end, after = rest.partition(MARKS[1])
     if not begin or not end:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import yaml
 
@@ -11,13 +13,19 @@ HEADER = "# Written by: python -m sb3_tbc.report --measured. Runs of tbc-hrl wit
 
 
 def measured_yaml(results: Results) -> str:
-    """Steps, mean minutes and number of our finished runs of each task, as YAML."""
+    """Steps, mean minutes and number of our finished runs of each task, as YAML.
+
+    Of runs with different numbers of steps, those with the commonest number count, among equals with the largest.
+    """
     tasks = {}
     for task, methods in results.items():
         runs = [run.final for run in methods.get(OURS, []) if run.final.get("wall_time")]
         if runs:
+            counts = Counter(int(run["n_timesteps"]) for run in runs)
+            steps = max(counts, key=lambda steps: (counts[steps], steps))
+            runs = [run for run in runs if run["n_timesteps"] == steps]
             tasks[task] = {
-                "steps": int(runs[0]["n_timesteps"]),
+                "steps": steps,
                 "minutes": round(float(np.mean([run["wall_time"] for run in runs])) / 60, 1),
                 "seeds": len(runs),
             }

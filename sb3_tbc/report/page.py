@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
+from urllib.parse import quote
 
 from sb3_tbc.report import curves
 from sb3_tbc.report.comparisons import against_baselines
@@ -203,8 +204,9 @@ def _films(results: Results, out: Path) -> list[str]:
 
 
 def _film(path: Path, out: Path) -> str:
-    link = escape(os.path.relpath(path, out.absolute().parent), quote=True)
-    return f'<p><video controls loop preload="metadata" src="{link}"></video><br><span class="soft">{link}</span></p>'
+    place = Path(os.path.relpath(path, out.absolute().parent)).as_posix()
+    link, name = escape(quote(os.fsencode(place)), quote=True), escape(place)
+    return f'<p><video controls loop preload="metadata" src="{link}"></video><br><span class="soft">{name}</span></p>'
 
 
 def _timeline(trace: Path, title: str) -> list[str]:

@@ -38,6 +38,7 @@ CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL = (
 RESUMED = "resumed"
 """In ``versions.json``: the versions of a run's later parts, where they are not those before."""
 SEED_FOLDER = re.compile("seed_[0-9]+")
+TENSORBOARD = "events.out.tfevents.*"
 LEDGER_FILES = (CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL)
 SOURCES = (":/sb3_tbc", ":/tasks", ":/zoo_configs")
 PACKAGES = (
@@ -220,7 +221,8 @@ class RunFolder:
         self.tidy()
         rest = (COMMAND, VERSIONS, EVALUATIONS, EVALUATION_EPISODES, MONITOR, self.model.name, self.best_model.name,
                 "progress.csv", "options.csv")  # fmt: skip
-        for path in (*(self.path / name for name in rest), *self.path.glob("*_until_*")):
+        logs = (path for pattern in ("*_until_*", TENSORBOARD) for path in self.path.glob(pattern))
+        for path in (*(self.path / name for name in rest), *logs):
             remove(path)
 
     def tidy(self) -> None:

@@ -135,6 +135,14 @@ def test_names_that_lead_elsewhere(text: str) -> None:
         folder_name(text, "the variant")
 
 
+@pytest.mark.parametrize("text", ["NUL", "con", "aux.v2", "COM1", "lpt9", "Prn.tar.gz", "com²", "nul .x"])
+def test_names_that_windows_keeps_for_devices(text: str) -> None:
+    for make in (folder_name, flat_name):
+        with pytest.raises(ConfigError, match="the variant must not be a name that Windows keeps for a device"):
+            make(text, "the variant")
+    assert folder_name(f"{text[:3]}sole", "the variant")
+
+
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "0.9", True, None, [1], 7, -3])
 def test_numbers_that_are_none(value: object) -> None:
     with pytest.raises(ConfigError, match="success_rate must"):

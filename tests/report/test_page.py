@@ -19,6 +19,7 @@ from made_up_runs import fake_run, small_ledger
 
 from sb3_tbc.report import command as report
 from sb3_tbc.report.curves import Style, figure, label_places, tick_distance
+from sb3_tbc.report.measured import measured_yaml
 from sb3_tbc.report.paper import load_paper
 from sb3_tbc.report.runs import load_results
 from sb3_tbc.report.timeline import last_episode, option_timeline
@@ -146,12 +147,13 @@ def test_films_and_options_of_runs_are_shown(ledger: Path, tmp_path: Path) -> No
         "5,0,5,5,0,expired,0,1\n9,0,6,4,1,reached,1,1\n12,1,3,3,1,reached,1,1\n"
         "15,0,8,6,1,reached,0,1\n20,0,5,5,0,expired,1,1\n23,0,4,3,1,reached,0,1\n"
     )
-    (tmp_path / "episodes.mp4").write_bytes(b"film")
+    (tmp_path / "100% #1.mp4").write_bytes(b"film")
     (run / "film.mp4").write_bytes(b"film")
     page = tmp_path / "page.html"
     assert report.main([str(ledger), "--html", str(page)]) == 0
     sources = [v for t, n, v in check(page.read_text()).attributes if (t, n) == ("video", "src")]
-    assert sources == ["episodes.mp4", "ledger/Pendulum/tbc-hrl/full/seed_0/film.mp4"]
+    assert "100% #1.mp4</span>" in page.read_text()
+    assert sources == ["100%25%20%231.mp4", "ledger/Pendulum/tbc-hrl/full/seed_0/film.mp4"]
     options = last_episode(run / "options.csv")
     assert [(o["duration"], o["reached"]) for o in options] == [(6, True), (5, False)]  # the last whole one
     svg = ET.fromstring(option_timeline(options))
@@ -224,8 +226,22 @@ def test_a_page_is_filled_between_its_marks(tmp_path: Path, capsys: pytest.Captu
     assert report.main([str(tmp_path / "results"), "--update", str(page)]) == 2
     assert "needs the lines" in capsys.readouterr().err
     assert page.read_text() == "no marks"
+    page.write_bytes("Größe <!-- results:begin -->\n<!-- results:end -->\n".encode("latin-1"))
+    assert report.main([str(tmp_path / "results"), "--update", str(page)]) == 2
+    assert "it is no UTF-8 text (invalid start byte at byte 2); save it as such\n" in capsys.readouterr().err
     assert report.main([str(tmp_path / "nowhere")]) == 2
     assert "no finished runs" in capsys.readouterr().err
+
+
+def test_minutes_are_those_of_runs_of_equal_length(tmp_path: Path) -> None:
+    for seed, (steps, seconds) in enumerate(((4000, 60.0), (9000, 6000.0), (4000, 120.0), (1000, 1.0))):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, n_timesteps=steps, wall_time=seconds)
+        fake_run(tmp_path, "B", "tbc-hrl", seed, 1.0, n_timesteps=steps + seed, wall_time=seconds)
+    measured = yaml.safe_load(measured_yaml(load_results(tmp_path)))["tasks"]
+    assert measured == {
+        "A": {"steps": 4000, "minutes": 1.5, "seeds": 2},
+        "B": {"steps": 9001, "minutes": 100.0, "seeds": 1},
+    }
 
 
 def test_the_committed_pages_are_what_the_ledger_gives(tmp_path: Path) -> None:

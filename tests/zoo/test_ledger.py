@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import json
+import os
+import stat
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
@@ -75,6 +77,7 @@ def test_life_of_a_run(tmp_path: Path) -> None:
         folder.copy_to(target)
 
     (folder.path / "notes.txt").write_text("mine")
+    (folder.path / "events.out.tfevents.1.machine.2.0").write_bytes(b"curves of the earlier run")
     folder.clear()
     assert [p.name for p in folder.path.iterdir()] == ["notes.txt"]
 
@@ -165,6 +168,43 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
     with pytest.raises(WriteError, match=r"cannot write .*final.json: No space left on device; make room"):
         write_atomic(path, "new")
     assert path.read_text() == "old"
+
+
+def test_a_link_stays_one_when_its_file_is_replaced(tmp_path: Path) -> None:
+    real, link, missing = tmp_path / "real" / "page.md", tmp_path / "page.md", tmp_path / "missing.md"
+    real.parent.mkdir()
+    real.write_text("old")
+    link.symlink_to(Path("real") / "page.md")
+    missing.symlink_to(Path("other") / "page.md")
+    for path in (link, missing):
+        write_atomic(path, "new")
+        assert path.is_symlink()
+    assert real.read_text() == (tmp_path / "other" / "page.md").read_text() == "new"
+    assert [p.name for p in real.parent.iterdir()] == ["page.md"]
+
+
+def test_what_is_synced_is_open_for_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows syncs no file that is open for reading alone, and opens no folder; some file systems sync no folder."""
+    fsync, synced = os.fsync, []
+
+    def windows(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        os.write(handle, b"")  # fails on a handle for reading
+        synced.append(handle)
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", windows)
+    write_atomic(tmp_path / "a.txt", "a")
+    assert len(synced) == 1
+
+    def broken(handle: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fsync", broken)
+    with pytest.raises(WriteError, match="Input/output error"):
+        write_atomic(tmp_path / "a.txt", "a")
 
 
 def test_curve_summary() -> None:
