@@ -86,7 +86,7 @@ def test_a_run_of_the_ledger_with_other_settings_is_not_done(
 ) -> None:
     first = next(iter(reproduce.jobs(campaign(tmp_path))))
     keep_result(first)
-    for more in ([], ["--dry-run"]):
+    for more in (["--dry-run"], []):
         assert reproduce.main(campaign(tmp_path, *asked, *more)) == 2
         said = capsys.readouterr()
         assert f"{first.target.path} holds another run: {told}; ask for that run with the same options" in said.err
