@@ -184,6 +184,13 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
+def remove_stale_lock(folder: Path) -> None:
+    """Remove the lock's file if its holder was killed; where nobody may write, or somebody holds it, it stays."""
+    if (folder / LOCK).exists():
+        with contextlib.suppress(FolderInUseError, WriteError), locked(folder):
+            pass
+
+
 def _take(path: Path) -> int:
     """A handle that holds the lock. If the former holder removed the file in the meantime, the next one is tried."""
     while True:

@@ -20,7 +20,7 @@ from sb3_tbc.errors import (
     TrainingError,
     WriteError,
 )
-from sb3_tbc.files import explained, locked, save_atomic
+from sb3_tbc.files import explained, locked, remove_stale_lock, save_atomic
 from sb3_tbc.outside import one_line
 from sb3_tbc.stopping import StopRequest
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
@@ -203,6 +203,7 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
     spec = RunSpec.from_dict(folder.read_config())
     changed = n_timesteps is not None and n_timesteps != spec.run.n_timesteps
     if folder.finished and not changed:
+        remove_stale_lock(folder.path)
         return folder.read_final()
     if n_timesteps is not None:
         spec = replace(spec, run=replace(spec.run, n_timesteps=n_timesteps))
