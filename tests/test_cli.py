@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 
-from sb3_tbc import __main__, evaluate, train
+from sb3_tbc import evaluate, train
 from sb3_tbc.zoo.algorithms import load_model
 from sb3_tbc.zoo.callbacks import write_evaluations
 from sb3_tbc.zoo.environments import make_envs
@@ -129,17 +129,6 @@ def test_watching_shows_every_frame(run: RunFolder, monkeypatch: pytest.MonkeyPa
     assert evaluate.main([str(run.model), "--n-episodes", "1", "--render", "--json", "-"]) == 0
     assert len(shown) > 1
     assert set(shown) == {shown[0]}
-
-
-def test_seeds_share_no_evaluation_episode() -> None:
-    from sb3_tbc.zoo.runner import evaluation_seed, final_seed
-
-    streams = [final_seed(seed) + env for seed in range(200) for env in range(10)]
-    streams += [evaluation_seed(seed) + 1000 * k + env for seed in range(200) for k in range(200) for env in range(10)]
-    assert len(set(streams)) == len(streams)
-    assert min(streams) >= 0
-    assert max(map(final_seed, (0, 10**9))) < 2**32
-    assert final_seed(0) == 2_000_000  # as in the committed ledger
 
 
 def test_names_without_regard_to_case(capsys: pytest.CaptureFixture[str]) -> None:
@@ -372,31 +361,6 @@ def test_mistakes_cost_one_line_and_write_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("arguments", [["--n-timesteps", "0"], ["--n-timesteps", "1.5"], ["--nonsense"]])
-def test_bad_arguments(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        train.main(arguments)
-    assert stop.value.code == 2
-    assert said(capsys).startswith("sb3_tbc.train: error: ")
-
-
-def test_an_action_space_that_is_no_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    import gymnasium as gym
-    from gymnasium import spaces
-
-    class Switch(gym.Env[Any, Any]):
-        observation_space = spaces.Dict(
-            {k: spaces.Box(-1, 1, (1,)) for k in ("observation", "achieved_goal", "desired_goal")}
-        )
-        action_space = spaces.Discrete(2)
-
-    if "SwitchGoal-v0" not in gym.registry:
-        gym.register("SwitchGoal-v0", Switch, disable_env_checker=True)
-    assert train.main(["--env", "SwitchGoal-v0", "--log-folder", str(tmp_path)]) == 2
-    assert "its actions must be a Box action space" in said(capsys)
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_zips_that_are_none_of_ours(run: RunFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     from stable_baselines3 import SAC
 
@@ -439,24 +403,6 @@ def test_a_flipped_byte_is_noticed(run: RunFolder, tmp_path: Path, capsys: pytes
     damaged.write_bytes(bytes(content))
     assert evaluate.main([str(damaged)]) == 2
     assert "damaged.zip" in said(capsys)
-
-
-def test_console_script(capsys: pytest.CaptureFixture[str]) -> None:
-    assert __main__.main(["--help"]) == 0
-    assert "evaluate" in capsys.readouterr().out
-    assert __main__.main(["evalute"]) == 2
-    assert "did you mean 'evaluate'?" in said(capsys)
-    assert __main__.main(["train", "--env", "Pendulm"]) == 2
-    assert "did you mean 'Pendulum'?" in said(capsys)
-
-
-def test_exit_status_of_the_process() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "sb3_tbc", "train", "--env", "Pendulm"], capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1
 
 
 def test_config_of_a_run_builds_the_same_run(run: RunFolder) -> None:

@@ -9,9 +9,11 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
 import sb3_tbc.tasks
+from test_cli import said
 
 from sb3_tbc import __main__, evaluate, train
 from sb3_tbc.benchmark import command as benchmark
@@ -264,3 +266,57 @@ def test_evaluations_by_hand_repeat_no_training_episode() -> None:
     seed = evaluate.build_parser().parse_args(["pretrained:Pendulum"]).seed
     taken = [first(run) for run in range(1000) for first in (evaluation_seed, final_seed)] + list(range(1000))
     assert min(abs(seed - other) for other in taken) > 1_000_000
+
+
+@pytest.mark.parametrize("arguments", [["--n-timesteps", "0"], ["--n-timesteps", "1.5"], ["--nonsense"]])
+def test_bad_arguments(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        train.main(arguments)
+    assert stop.value.code == 2
+    assert said(capsys).startswith("sb3_tbc.train: error: ")
+
+
+def test_an_action_space_that_is_no_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import gymnasium as gym
+    from gymnasium import spaces
+
+    class Switch(gym.Env[Any, Any]):
+        observation_space = spaces.Dict(
+            {k: spaces.Box(-1, 1, (1,)) for k in ("observation", "achieved_goal", "desired_goal")}
+        )
+        action_space = spaces.Discrete(2)
+
+    if "SwitchGoal-v0" not in gym.registry:
+        gym.register("SwitchGoal-v0", Switch, disable_env_checker=True)
+    assert train.main(["--env", "SwitchGoal-v0", "--log-folder", str(tmp_path)]) == 2
+    assert "its actions must be a Box action space" in said(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_console_script(capsys: pytest.CaptureFixture[str]) -> None:
+    assert __main__.main(["--help"]) == 0
+    assert "evaluate" in capsys.readouterr().out
+    assert __main__.main(["evalute"]) == 2
+    assert "did you mean 'evaluate'?" in said(capsys)
+    assert __main__.main(["train", "--env", "Pendulm"]) == 2
+    assert "did you mean 'Pendulum'?" in said(capsys)
+
+
+def test_exit_status_of_the_process() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "sb3_tbc", "train", "--env", "Pendulm"], capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+
+
+def test_seeds_share_no_evaluation_episode() -> None:
+    from sb3_tbc.zoo.runner import evaluation_seed, final_seed
+
+    streams = [final_seed(seed) + env for seed in range(200) for env in range(10)]
+    streams += [evaluation_seed(seed) + 1000 * k + env for seed in range(200) for k in range(200) for env in range(10)]
+    assert len(set(streams)) == len(streams)
+    assert min(streams) >= 0
+    assert max(map(final_seed, (0, 10**9))) < 2**32
+    assert final_seed(0) == 2_000_000  # as in the committed ledger

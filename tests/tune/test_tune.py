@@ -26,7 +26,7 @@ from sb3_tbc.tune import command as tune
 from sb3_tbc.tune import study as studies
 from sb3_tbc.tune import trial as trials
 from sb3_tbc.tune import worker
-from sb3_tbc.tune.results import difference, find_trial, importances, write_plots, write_trial
+from sb3_tbc.tune.results import difference, find_trial, write_trial
 from sb3_tbc.tune.study import ORIGIN, REASON, open_storage, read_settings
 from sb3_tbc.zoo.callbacks import SuccessEvalCallback, read_evaluations
 from sb3_tbc.zoo.config import load_config
@@ -430,43 +430,12 @@ def test_a_refused_combination_is_pruned_not_fatal(tmp_path: Path, monkeypatch: 
     assert load(tmp_path).trials[1].user_attrs[REASON] == "refused: no room"
 
 
-def test_plots_and_importances(tmp_path: Path) -> None:
-    study = optuna.create_study(direction="maximize", study_name="toy")
-    study.set_user_attr("settings", {"objective": "auc"})
-    assert write_plots(study, tmp_path) == []
-    rng = np.random.default_rng(0)
-    space = {n: optuna.distributions.FloatDistribution(0, 1) for n in ("matters", "idle")}
-    for _ in range(40):
-        x, y = rng.random(2)
-        params = {"matters": x, "idle": y}
-        study.add_trial(optuna.create_trial(params=params, distributions=space, value=x))
-    shares = importances(study)
-    assert shares["matters"] > 5 * shares["idle"]
-    assert [p.name for p in write_plots(study, tmp_path)] == ["history.png", "importances.png"]
-
-
-def test_equal_trials_have_no_importances() -> None:
-    study = optuna.create_study(direction="maximize")
-    for x in np.linspace(0, 1, 10):
-        distributions = {"idle": optuna.distributions.FloatDistribution(0, 1)}
-        study.add_trial(optuna.create_trial(params={"idle": float(x)}, distributions=distributions, value=0.0))
-    assert importances(study) == {}
-
-
 def test_a_text_that_looks_like_a_number_stays_one_in_a_trials_file(tmp_path: Path) -> None:
     settings = tune.new_settings(tune.build_parser().parse_args(arguments(tmp_path, *SHORT, *TINY)))
     run = {**settings.base, "env_kwargs": {"map": "3e-4"}}
     trial = optuna.create_trial(value=0.0, user_attrs={ORIGIN: "default"})
     path = write_trial(replace(settings, baselines={"default": run}), trial, "study", tmp_path / "best.yml")
     assert load_config("tbc-hrl", "TunedCorridor-v0", path=path).env_kwargs == {"map": "3e-4"}
-
-
-def test_difference_is_what_merging_needs() -> None:
-    assert difference({"a": 1, "b": {"c": 1, "d": 2}}, {"a": 1, "b": {"c": 1, "d": 3}, "e": None}) == {
-        "b": {"d": 3},
-        "e": None,
-    }
-    assert difference({"a": 1}, {"a": True}) == {"a": True}
 
 
 def test_help_needs_no_optuna() -> None:
