@@ -175,7 +175,7 @@ def command(argv: Sequence[str]) -> int:
     todo = [job for job in planned if not _done(job)]
     print(f"{len(planned)} runs, {len(planned) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
     if args.dry_run:
-        print("\n".join(plan(todo, args.workers, read_speeds(args.ledger), lambda job: job.name)))
+        print("\n".join(plan(todo, args.workers, read_speeds(args.ledger))))
         return 0
     if not todo:
         return 0

@@ -140,19 +140,11 @@ class Scene:
 
     def add_geom(self, kind: mujoco.mjtGeom, size: ArrayLike, position: ArrayLike, rgba: Sequence[float]) -> None:
         """Add a free-standing shape (a ``mujoco.mjtGeom``) of half-sizes ``size``."""
-        geom = self._next_geom()
+        geom = self.scene.geoms[self.scene.ngeom]
+        self.scene.ngeom += 1
         mujoco.mjv_initGeom(
             geom, kind.value, np.array(size, float), np.array(position, float), np.eye(3).ravel(), np.array(rgba, "f4")
         )
-
-    def add_arrow(self, start: ArrayLike, vector: ArrayLike, rgba: Sequence[float], width: float = 0.05) -> None:
-        """Add an arrow from ``start`` along ``vector``; nothing if it is too short to see."""
-        begin, along = np.array(start, float), np.array(vector, float)
-        if np.linalg.norm(along) < width:
-            return
-        geom, arrow = self._next_geom(), mujoco.mjtGeom.mjGEOM_ARROW.value
-        mujoco.mjv_initGeom(geom, arrow, np.zeros(3), np.zeros(3), np.zeros(9), np.array(rgba, "f4"))
-        mujoco.mjv_connector(geom, arrow, width, begin, begin + along)
 
     def project(self, point: ArrayLike) -> tuple[float, float]:
         """Where a point of the world appears: pixels from the left and from the bottom of the picture."""
@@ -173,10 +165,6 @@ class Scene:
         mujoco.mj_kinematics(self.model, ghost)
         bodies = [(ghost.body(name), np.array(point, float)) for name, point in on_bodies]
         return [body.xpos + body.xmat.reshape(3, 3) @ point for body, point in bodies]
-
-    def _next_geom(self) -> Any:
-        self.scene.ngeom += 1
-        return self.scene.geoms[self.scene.ngeom - 1]
 
     def picture(self) -> NDArray[np.uint8]:
         """Render, ``(height, width, 3)``."""

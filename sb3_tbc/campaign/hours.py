@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean, median
 from typing import NamedTuple
@@ -117,11 +117,11 @@ def hours_together(hours: Sequence[float], workers: int) -> float:
     return max(ends)
 
 
-def plan(todo: Sequence[Job], workers: int, speeds: Speeds, name: Callable[[Job], str]) -> list[str]:
+def plan(todo: Sequence[Job], workers: int, speeds: Speeds) -> list[str]:
     """What ``--dry-run`` prints: every run with its hours, and the sum."""
     hours = [hours_of(job, speeds) for job in todo]
     lines = [
-        f"to do   {name(job)}   {job.n_timesteps:,} steps, {'hours unknown' if h is None else f'{h:.2f} h'}"
+        f"to do   {job.name}   {job.n_timesteps:,} steps, {'hours unknown' if h is None else f'{h:.2f} h'}"
         for job, h in zip(todo, hours, strict=True)
     ]
     known = [h for h in hours if h is not None]

@@ -15,7 +15,6 @@ from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, Exporte
 from sb3_tbc.outside import one_line
 
 OPSET = 17
-STATE_NAMES = ("subgoal", "time_budget", "elapsed", "membrane")
 
 
 class _Graph:

@@ -91,11 +91,9 @@ def picture_of(model: TBCHRL, task: str, units: CircuitUnits, traces: Sequence[T
     :raises MissingExtraError: without matplotlib
     """
     require("matplotlib", extra="plots", what="the picture of the circuit")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9.0, 5.0))
-    FigureCanvasAgg(figure)
     draw_agent(model, task, units, traces, figure.add_axes((0.08, 0.02, 0.9, 0.94)))
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=130)

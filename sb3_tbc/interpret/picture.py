@@ -39,13 +39,11 @@ def activation_in_space(
     :raises MissingExtraError: if matplotlib is not installed
     """
     require("matplotlib", extra="plots", what="the picture")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = min(COLUMNS, len(which))
     rows = -(-len(which) // columns)
     figure = Figure(figsize=(3.1 * columns, 2.9 * rows + 0.5), layout="constrained")
-    FigureCanvasAgg(figure)
     panels = np.atleast_1d(figure.subplots(rows, columns, sharex=True, sharey=True)).ravel()
     places = [places_of(trace, space, subgoals) for trace in traces]
     for panel, unit in zip(panels, which, strict=False):

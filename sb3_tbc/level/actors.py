@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch as th
 from gymnasium import spaces
@@ -127,19 +127,6 @@ class MLPActor(Actor):
         return mean, log_std, {}
 
 
-class MemoryNet(Protocol):
-    """A network with a state: outputs and next state of one control step."""
-
-    state_dim: int
-    sub_steps: int
-
-    def initial_state(self, batch_size: int) -> th.Tensor:
-        """The state before anything happened, ``(batch_size, state_dim)``."""
-
-    def after_update(self, n_updates: int) -> None:
-        """Bring up to date what depends on the weights."""
-
-
 class GRUNet(nn.Module):
     """A gated recurrent unit with a linear readout.
 
@@ -211,7 +198,7 @@ class MemoryActor(BasePolicy):
 
     @abstractmethod
     def make_net(self, n_inputs: int, n_outputs: int) -> Any:
-        """The network, a :class:`MemoryNet`; its weights are drawn from torch's generator."""
+        """The network, with the interface of :class:`GRUNet`; its weights are drawn from torch's generator."""
 
     def step(self, obs: th.Tensor, state: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         """One control step: mean and log_std ``(batch, action_dim)`` and the next state ``(batch, state_dim)``."""

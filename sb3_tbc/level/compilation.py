@@ -66,15 +66,10 @@ def _compile(step: Callable[..., None], example: Sequence[th.Tensor]) -> Callabl
     merge_repeated(graph)
     for node in graph.graph.nodes:
         node.meta.clear()  # the compiler derives shapes itself and refuses those of another tracer
-    import torch._inductor as inductor
+    from torch._inductor import standalone_compile
 
-    standalone = getattr(inductor, "standalone_compile", None)
-    compiled: Callable[..., None]
-    if standalone is None:  # before torch 2.8: about 60 microseconds more per call, for checks of the arguments
-        compiled = th.compile(graph, fullgraph=True, dynamic=False, options=dict(INDUCTOR))
-    else:
-        options = {"config_patches": dict(INDUCTOR)}
-        compiled = standalone(graph, copies, dynamic_shapes="from_example_inputs", options=options)
+    options = {"config_patches": dict(INDUCTOR)}
+    compiled = standalone_compile(graph, [*copies], dynamic_shapes="from_example_inputs", options=options)
     logger.info("compiled an update in %.1f s", time.perf_counter() - start)
     return compiled
 

@@ -56,17 +56,6 @@ def check_finite(
         )
 
 
-def check_parameters(net: NDBCNet, level: str = "low", step: int = 0) -> None:
-    """Raise if a parameter or its gradient is NaN or infinite.
-
-    :raises NonFiniteError: names level, parameter and step
-    """
-    for name, parameter in net.named_parameters():
-        for what, tensor in (("value", parameter), ("gradient", parameter.grad)):
-            if tensor is not None and not bool(th.isfinite(tensor).all()):
-                raise NonFiniteError(f"{level} level, {what} of {name}, step {step}: not finite")
-
-
 class ParameterCount(NamedTuple):
     """Parameters of a network beside those of an MLP with the same inputs and outputs."""
 

@@ -18,18 +18,13 @@ from sb3_tbc.smdp.options import Episode, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
-GOAL_STRATEGIES = ("future", "episode", "event")
-"""Where the high level's hindsight goals come from."""
-
 
 def check_goal_strategy(strategy: str, subgoals: SubgoalSpace | None) -> None:
     """Check that hindsight goals can be chosen this way.
 
     :param subgoals: the task's
-    :raises ValueError: if the strategy is unknown, or the task has no such event
+    :raises ValueError: if they are to come from an event and the task names none
     """
-    if strategy not in GOAL_STRATEGIES:
-        raise ValueError(f"goal_strategy must be one of {', '.join(GOAL_STRATEGIES)}, got {strategy!r}")
     if strategy == "event" and (subgoals is None or subgoals.event is None):
         raise ValueError(
             "goal_strategy 'event' takes goals from the step of a task's event, and this task names none: use 'future' "

@@ -23,7 +23,7 @@ def test_hours_from_finished_runs(tmp_path: Path) -> None:
     assert hours_of(job, speeds) == pytest.approx(1000 / 200 / 3600)
     unknown = make_job(tmp_path, 9, env="Drawbridge")
     assert hours_of(unknown, speeds) is None
-    lines = plan([job, unknown], 2, speeds, lambda job: job.name)
+    lines = plan([job, unknown], 2, speeds)
     assert lines[0] == "to do   Pendulum hits full seed 9   1,000 steps, 0.00 h"
     assert lines[1].endswith("hours unknown")
     assert "with 2 at a time" in lines[2]
@@ -46,18 +46,18 @@ def test_the_last_run_ends_when_its_turn_is_over(hours: list[float], workers: in
 
 def test_a_plan_waits_for_its_longest_run(tmp_path: Path) -> None:
     speeds = Speeds({}, {}, {}, {("Pendulum", ""): 1000 / 3600})
-    plans = plan([make_job(tmp_path), make_job(tmp_path, 1)], 40, speeds, lambda job: job.name)
+    plans = plan([make_job(tmp_path), make_job(tmp_path, 1)], 40, speeds)
     assert "2.0 hours of one core at measured speeds, evaluations included; about 1.0 hours with 40" in plans[-1]
 
 
 def test_hours_without_evaluations_are_not_said_to_include_them(tmp_path: Path) -> None:
     rows = {("Pendulum", "hits"): 1000 / 3600}
     job = replace(make_job(tmp_path), n_episodes=100)
-    (_, last) = plan([job], 1, Speeds(rows, rows, {}, {}), lambda job: job.name)
+    (_, last) = plan([job], 1, Speeds(rows, rows, {}, {}))
     assert last.endswith("1.0 hours of one core at measured speeds, evaluations included except those of 1 runs, whose "
         "episodes' length is unknown")  # fmt: skip
     for known, planned in (({("Pendulum", ""): 5.0}, job), ({}, replace(job, n_episodes=0))):
-        (_, last) = plan([planned], 1, Speeds(rows, rows, known, {}), lambda job: job.name)
+        (_, last) = plan([planned], 1, Speeds(rows, rows, known, {}))
         assert last.endswith("evaluations included")
 
 
