@@ -74,15 +74,8 @@ def episodes_under(model: TBCHRL, env_id: str, env_kwargs: Mapping[str, object],
     """Episodes of an agent that acts as in an evaluation, in the order of environments and their episodes."""
     venv = evaluation_envs(env_id, n, seed, dict(env_kwargs))
     try:
-        rng = np.random.default_rng(seed)
-        runner = TwoLevelRunner(venv, model.actor, model.views, model.rules, rng, model.schedule, deterministic=True)
-        runner.reset()
-        per_env = -(-n // venv.num_envs)
-        found: list[list[Episode]] = [[] for _ in range(venv.num_envs)]
-        while min(len(row) for row in found) < per_env:
-            for index, episode in runner.step().episodes.items():
-                found[index].append(episode)
-        return [row[i] for i in range(per_env) for row in found][:n]
+        runner = TwoLevelRunner(venv, model.policy, np.random.default_rng(seed), deterministic=True)
+        return runner.run(n, lambda episode: episode)
     finally:
         venv.close()
 

@@ -105,7 +105,7 @@ def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[st
             f"the low level of this agent remembers (memory={model.config.memory!r}), so that its inputs alone do not "
             "tell its actions; record an agent with memory='none' or with an MLP"
         )
-    runner = TwoLevelRunner(env, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule)
+    runner = TwoLevelRunner(env, model.policy, np.random.default_rng(seed))
     env.seed(seed)
     runner.reset()
     n_inputs, n_means = runner.observation.shape[1], int(np.prod(model.action_space.shape or ()))

@@ -138,7 +138,7 @@ class _LesionedRunner(TwoLevelRunner):
 
     def __init__(self, model: TBCHRL, units: Units, venv: VecEnv, lesion: Lesion) -> None:
         rng = np.random.default_rng(0)  # both levels act by their means and draw nothing
-        super().__init__(venv, model.actor, model.views, model.rules, rng, model.schedule, deterministic=True)
+        super().__init__(venv, model.policy, rng, deterministic=True)
         self.units, self.lesion = units, lesion
         self.log: list[tuple[FloatArray, FloatArray, FloatArray]] = []
 

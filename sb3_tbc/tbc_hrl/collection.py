@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
@@ -12,7 +12,7 @@ from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.guard import OnBadStep
-from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep, HierarchicalVecEnv, Proposal, Schedule
+from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep, HierarchicalVecEnv, Proposal
 from sb3_tbc.smdp.hindsight import (
     GoalTest,
     HighLevelSteps,
@@ -24,7 +24,9 @@ from sb3_tbc.smdp.options import Episode, OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.smdp.views import LevelViews
-from sb3_tbc.tbc_hrl.actor import TwoLevelActor
+from sb3_tbc.tbc_hrl.policy import TBCPolicy
+
+T = TypeVar("T")
 
 
 class Exploration(NamedTuple):
@@ -39,11 +41,8 @@ class TwoLevelRunner:
     """Both levels at work in a vector of goal environments, step by step.
 
     :param venv: the environments
-    :param actor: both levels
-    :param views: what each level sees
-    :param rules: what ends an option
+    :param policy: both levels
     :param rng: source of all randomness here
-    :param schedule: gives the time budgets where the high level does not
     :param deterministic: act as in an evaluation
     :param on_bad_step: what follows where an environment gives what is not finite
     """
@@ -51,25 +50,17 @@ class TwoLevelRunner:
     def __init__(
         self,
         venv: VecEnv,
-        actor: TwoLevelActor,
-        views: LevelViews,
-        rules: OptionRules,
+        policy: TBCPolicy,
         rng: np.random.Generator,
-        schedule: Schedule | None = None,
         deterministic: bool = False,
         on_bad_step: OnBadStep = "stop",
     ) -> None:
+        actor = policy.actor
         self.actor, self.rng, self.deterministic = actor, rng, deterministic
         self.env = HierarchicalVecEnv(
-            venv,
-            self.propose,
-            views,
-            rules,
-            actor.low.state_dim,
-            schedule,
-            actor.reconsideration,
-            on_bad_step,
-        )
+            venv, self.propose, policy.views, policy.rules, actor.low.state_dim, policy.schedule,
+            actor.reconsideration, on_bad_step,
+        )  # fmt: skip
         self.membrane = actor.blank(venv.num_envs)
         self.observation: FloatArray = np.zeros(0)  # the low level's
 
@@ -95,6 +86,22 @@ class TwoLevelRunner:
         self.membrane = self.actor.forget(after, step.window_over, step.episode_over)
         return step
 
+    def run(self, n_episodes: int, read: Callable[[Episode], T]) -> list[T]:
+        """Run whole episodes from new starts, ordered by round, then environment.
+
+        Every environment runs the same number of them (rounded up, the surplus is left out), so that short episodes
+        are not over-represented.
+
+        :param read: what to keep of an episode
+        """
+        self.reset()
+        found: list[list[T]] = [[] for _ in range(self.env.num_envs)]
+        per_env = -(-n_episodes // self.env.num_envs)
+        while min(len(rows) for rows in found) < per_env:
+            for index, episode in self.step().episodes.items():
+                found[index].append(read(episode))
+        return [rows[i] for i in range(per_env) for rows in found][:n_episodes]
+
     def propose(self, observations: FloatArray, where: Indices) -> Proposal:
         """The high level's options for the environments ``where``."""
         unit = self.actor.propose(observations, self.deterministic, self.rng)
@@ -116,15 +123,12 @@ class Collector(TwoLevelRunner):
     def __init__(
         self,
         venv: VecEnv,
-        actor: TwoLevelActor,
-        views: LevelViews,
-        rules: OptionRules,
+        policy: TBCPolicy,
         rng: np.random.Generator,
-        schedule: Schedule | None,
         exploration: Exploration,
         on_bad_step: OnBadStep = "stop",
     ) -> None:
-        super().__init__(venv, actor, views, rules, rng, schedule, on_bad_step=on_bad_step)
+        super().__init__(venv, policy, rng, on_bad_step=on_bad_step)
         self.exploration = exploration
 
     def get_state(self) -> Arrays:

@@ -89,7 +89,7 @@ def evaluate_flat(
         for index in np.flatnonzero(dones):
             results[index].append((infos[index]["is_success"], *totals[:, index], np.nan, np.nan, 0, False))
             totals[:, index] = 0.0
-    return _columns([rows[i] for i in range(per_env) for rows in results], n_eval_episodes)
+    return _columns([rows[i] for i in range(per_env) for rows in results][:n_eval_episodes])
 
 
 def evaluate_hierarchical(
@@ -116,14 +116,10 @@ def evaluate_hierarchical(
     same = goal_parts(venv.observation_space) == goal_parts(model.observation_space)  # it sees nothing else
     if not same or venv.action_space != model.action_space:
         check_for_correct_spaces(venv, model.observation_space, model.action_space)
-    runner = TwoLevelRunner(
-        venv, model.actor, model.views, model.rules, np.random.default_rng(seed), model.schedule, deterministic,
-        model.config.on_bad_step,
-    )  # fmt: skip
+    runner = TwoLevelRunner(venv, model.policy, np.random.default_rng(seed), deterministic, model.config.on_bad_step)
     if seed is not None:
         venv.seed(seed)
-    per_env = -(-n_eval_episodes // venv.num_envs)
-    return _columns(_run(runner, per_env), n_eval_episodes)
+    return _columns(runner.run(n_eval_episodes, _row))
 
 
 def _vector(env: VecEnv | Env, n_eval_episodes: int) -> VecEnv:
@@ -132,20 +128,10 @@ def _vector(env: VecEnv | Env, n_eval_episodes: int) -> VecEnv:
     return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
 
 
-def _columns(rows: list[Row], n_eval_episodes: int) -> EvaluationResult:
-    columns = list(zip(*rows[:n_eval_episodes], strict=True))
+def _columns(rows: list[Row]) -> EvaluationResult:
     types = (bool, np.int64, np.float64, np.float64, np.float64, np.int64, bool)
-    return EvaluationResult(*(np.array(column, dtype=t) for column, t in zip(columns, types, strict=True)))
-
-
-def _run(runner: TwoLevelRunner, per_env: int) -> list[Row]:
-    """``per_env`` episodes in every environment; one row each, ordered by round, then environment."""
-    runner.reset()
-    results: list[list[Row]] = [[] for _ in range(runner.env.num_envs)]
-    while min(len(rows) for rows in results) < per_env:
-        for index, episode in runner.step().episodes.items():
-            results[index].append(_row(episode))
-    return [rows[i] for i in range(per_env) for rows in results]
+    columns = zip(zip(*rows, strict=True), types, strict=True)
+    return EvaluationResult(*(np.array(column, dtype=kind) for column, kind in columns))
 
 
 def _row(episode: Episode) -> Row:

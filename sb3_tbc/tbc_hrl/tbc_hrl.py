@@ -319,8 +319,7 @@ class TBCHRL(TwoLevelSaving):
         self.actor.notice_changes()
         if anew or self.collector is None:
             explore = assembly.exploration(self.config)
-            self.collector = Collector(env, self.actor, self.views, self.rules, self.rng, self.schedule, explore,
-                                       self.config.on_bad_step)  # fmt: skip
+            self.collector = Collector(env, self.policy, self.rng, explore, self.config.on_bad_step)
             self.collector.begin(self._last_obs if anew else env.reset())  # type: ignore[arg-type]
         if resumed:
             resume.set_state(self._moving_parts(), resumed)

@@ -157,24 +157,20 @@ def test_it_pays_what_the_agent_learns_from(duration: str) -> None:
     """The agent's own transitions of an episode, without hindsight, beside the rewards of the same options here."""
     settings: dict[str, Any] = {"max_options": 5, "duration": duration, "duration_cost": 2.0, "testing_fraction": 0.0}
     agent = TBCHRL("MultiInputPolicy", Corridor(), compile=False, seed=0, **settings)
-    runner = TwoLevelRunner(
-        DummyVecEnv([lambda: Corridor(goal=0.99)]), agent.actor, agent.views, agent.rules, np.random.default_rng(0),
-        agent.schedule, deterministic=True,
-    )  # fmt: skip
-    runner.env.venv.seed(3)
-    runner.reset()
-    while not (episodes := runner.step().episodes):
-        pass
+    venv = DummyVecEnv([lambda: Corridor(goal=0.99)])
+    venv.seed(3)
+    runner = TwoLevelRunner(venv, agent.policy, np.random.default_rng(0), deterministic=True)
+    (episode,) = runner.run(1, lambda episode: episode)
     no_hindsight = HindsightSettings(0, "future", -10.0, True, tolerance=-1.0)
     learnt = high_level_steps(
-        episodes[0], agent.subgoals, agent.rules, agent.high_reward, no_hindsight, runner.env.judge.goal_test,
+        episode, agent.subgoals, agent.rules, agent.high_reward, no_hindsight, runner.env.judge.goal_test,
         agent.views.high, np.random.default_rng(0),
     ).rewards  # fmt: skip
     env = OptionEnv(DummyVecEnv([lambda: Corridor(goal=0.99)]), agent)
     env.seed(3)
     env.reset()
     width = agent.views.high_action_space().shape[0]
-    paid = [env.step(option.unit_action[None, :width])[1][0] for option in episodes[0].options]
+    paid = [env.step(option.unit_action[None, :width])[1][0] for option in episode.options]
     assert len(paid) == 5
     np.testing.assert_allclose(learnt[:5], paid, rtol=1e-5)
 
