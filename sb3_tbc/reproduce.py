@@ -30,10 +30,19 @@ from sb3_tbc.commands import (
 )
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import parse_yaml
-from sb3_tbc.train import N_EVAL_EPISODES, build_spec, default_eval_freq, variant_name
 from sb3_tbc.train import build_parser as build_train_parser
+from sb3_tbc.train import build_spec, variant_name
 from sb3_tbc.zoo.algorithms import ALGORITHMS, algorithm
-from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, RunConfig, ablations_of, load_config, parse_overrides
+from sb3_tbc.zoo.config import (
+    ABLATIONS,
+    CONFIGS,
+    N_EVAL_EPISODES,
+    RunConfig,
+    ablations_of,
+    default_eval_freq,
+    load_config,
+    parse_overrides,
+)
 from sb3_tbc.zoo.environments import resolve_env, task_names
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import RunSpec

@@ -19,14 +19,21 @@ from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.zoo.ablations import match_parameters
 from sb3_tbc.zoo.algorithms import algorithm
-from sb3_tbc.zoo.config import ABLATIONS, CONFIGS, OF_PAPER, RunConfig, load_config, parse_overrides
+from sb3_tbc.zoo.config import (
+    ABLATIONS,
+    CONFIGS,
+    N_EVAL_EPISODES,
+    OF_PAPER,
+    RunConfig,
+    default_eval_freq,
+    load_config,
+    parse_overrides,
+)
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
 from sb3_tbc.zoo.settings_page import settings_text
 
-N_EVAL_EPISODES = 20
-"""Episodes of each evaluation along the curve, where nothing else is said."""
 NOT_RESUMED = (
     *("algo", "env", "seed", "n_envs", "config", "config_file", "ablation", "hyperparams", "on_bad_step"),
     *("eval_freq", "n_eval_episodes", "n_final_episodes", "log_folder", "variant", "overwrite"),
@@ -153,11 +160,6 @@ def config_and_file(args: argparse.Namespace) -> tuple[str | None, Path | None]:
     if args.config_file is not None:
         raise ConfigError(f"--config {path} and --config-file {args.config_file} name two files; give one")
     return None, path
-
-
-def default_eval_freq(n_timesteps: int) -> int:
-    """Environment steps between two evaluations of a run of ``n_timesteps``."""
-    return max(n_timesteps // 40, 500)
 
 
 def variant_name(run: RunConfig, ablation: str | None, config: str | None) -> str:

@@ -12,13 +12,11 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.reading import read_yaml
 from sb3_tbc.report.runs import SHIPPED, Results, Run
-from sb3_tbc.zoo.config import OF_PAPER, load_config
+from sb3_tbc.zoo.config import N_EVAL_EPISODES, OF_PAPER, default_eval_freq, load_config
 
 CAMPAIGN = "campaign.yml"
 """In the folder of results: ``first_seed``, ``options`` of every command, and ``runs`` with task, methods, seeds, and
 ``first_seed`` and ``options`` of their own."""
-N_EVAL_EPISODES = 20
-"""Episodes in an evaluation along the curve, where the plan does not say: the default of ``sb3_tbc.train``."""
 
 
 class Planned(NamedTuple):
@@ -50,7 +48,7 @@ class Planned(NamedTuple):
         """Steps of training, steps between evaluations and episodes in each, under their names in ``config.yml``."""
         steps = self.n_timesteps or _shipped_steps(self.algo, self.task, self.config, self.ablation)
         freq, episodes = self._option("--eval-freq"), self._option("--n-eval-episodes")
-        counts = {"eval_freq": freq or eval_freq_of(steps), "n_eval_episodes": episodes or N_EVAL_EPISODES}
+        counts = {"eval_freq": freq or default_eval_freq(steps), "n_eval_episodes": episodes or N_EVAL_EPISODES}
         return {"n_timesteps": steps, **counts}
 
     def _option(self, name: str) -> int:
@@ -73,11 +71,6 @@ class Planned(NamedTuple):
 @cache
 def _shipped_steps(algo: str, task: str, config: str | None, ablation: str | None) -> int:
     return load_config(algo, task, config, ablation=ablation).n_timesteps
-
-
-def eval_freq_of(n_timesteps: int) -> int:
-    """Steps between evaluations where the plan does not say: the default of ``sb3_tbc.train``."""
-    return max(n_timesteps // 40, 500)
 
 
 def missing_table(root: Path, results: Results) -> list[list[str]]:

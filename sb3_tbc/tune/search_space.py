@@ -18,7 +18,7 @@ from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.reading import SettingsLoader, read_yaml
 from sb3_tbc.tbc_hrl.config import CircuitConfig
-from sb3_tbc.zoo.config import RunConfig, merge
+from sb3_tbc.zoo.config import RunConfig, changed, merge, nested
 from sb3_tbc.zoo.schema import CONFIG_CLASSES, RUN, validate
 
 Label = str | int | float | bool | None
@@ -131,8 +131,8 @@ def _plain(value: object) -> object:
 def read_key(run: RunConfig, key: str) -> object:
     """A configuration's value of a dotted key, or the agent's default if the configuration does not set it."""
     first, *rest = key.split(".")
-    value: object = run.env_kwargs if first == "env_kwargs" else getattr(run, first) if first in RUN else None
-    value = run.model.get(first) if first not in RUN else value
+    value: object = getattr(run, first) if first in RUN else run.model.get(first)
+    value = run.env_kwargs.get("subgoals") if first == "subgoals" else value
     for name in rest:
         value = value.get(name) if isinstance(value, Mapping) else None
     if value is None and len(rest) == 1 and first in ("low", "high"):
@@ -147,16 +147,6 @@ def _default(algo: str, key: str) -> object:
     if algo not in CONFIG_CLASSES:
         return None
     return _written(CONFIG_CLASSES[algo]().to_dict(), key)
-
-
-def nested(settings: PlainMapping) -> Plain:
-    """``{"low.tau": 1}`` as ``{"low": {"tau": 1}}``."""
-    result: Plain = {}
-    for key, value in settings.items():
-        for name in reversed(key.split(".")):
-            value = {name: value}
-        result = merge(result, value)
-    return result
 
 
 # --------------------------------------------------------------------------------------------- reading
@@ -414,11 +404,7 @@ def apply(space: Space, values: PlainMapping, run: RunConfig) -> RunConfig:
         if SCHEDULE in values and (key in settings or not _follows_another(run, key)):
             rate = _plain(settings.get(key, read_key(run, key)))
             settings[key] = f"lin_{rate!r}" if values[SCHEDULE] == "linear" else rate
-    change = validate(nested(settings), run.algo, "trial")
-    in_run = {key: change.pop(key) for key in RUN if key in change}
-    if "env_kwargs" in in_run:
-        in_run["env_kwargs"] = merge(run.env_kwargs, in_run["env_kwargs"])
-    return replace(run, model=merge(run.model, change), **in_run)
+    return changed(run, validate(nested(settings), run.algo, "trial"), "the search space")
 
 
 def complete(run: RunConfig, action_dim: int) -> RunConfig:

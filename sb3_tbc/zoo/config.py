@@ -17,6 +17,8 @@ from sb3_tbc.zoo.schema import RUN, validate
 CONFIGS = ("paper", "tuned")
 OF_PAPER = "-paper"
 """Ends the names of variants that have the values of the paper's tables."""
+N_EVAL_EPISODES = 20
+"""Episodes of each evaluation along the curve, where nothing else is said."""
 OTHER = "other"
 """Section of configuration files for environments that have none of their own."""
 PARTS: dict[str, tuple[Plain, Plain]] = {
@@ -95,12 +97,27 @@ class RunConfig:
             raise ConfigError(f"not a run's config.yml: {error}") from error
 
 
+def default_eval_freq(n_timesteps: int) -> int:
+    """Environment steps between two evaluations of a run of ``n_timesteps``, where nothing else is said."""
+    return max(n_timesteps // 40, 500)
+
+
 def merge(base: PlainMapping, change: PlainMapping) -> Plain:
     """``base`` updated with ``change``, section by section; a ``None`` replaces a whole section."""
     result = dict(base)
     for key, value in change.items():
         old = result.get(key)
         result[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
+def nested(settings: PlainMapping) -> Plain:
+    """``{"low.tau": 1}`` as ``{"low": {"tau": 1}}``."""
+    result: Plain = {}
+    for key, value in settings.items():
+        for name in reversed(key.split(".")):
+            value = {name: value}
+        result = merge(result, value)
     return result
 
 
@@ -157,9 +174,7 @@ def parse_overrides(items: Sequence[str]) -> Plain:
         if name.count(".") > MAX_DEPTH:
             raise ConfigError(f"--hyperparams {one_line(item)!r}: more than {MAX_DEPTH} sections in one another")
         value = parse_yaml(text, f"the value of --hyperparams {one_line(item)!r}", SettingsLoader)
-        for key in reversed(name.split(".")):
-            value = {key: value}
-        result = merge(result, value)
+        result = merge(result, nested({name: value}))
     return validate(result, None, "--hyperparams")
 
 
@@ -200,30 +215,45 @@ def load_config(
         changes = [tuned, changes[0], own.get(ablation or "", {}), given]
     for change in changes:
         merged = merge(merged, change)
-    subgoals = merged.pop("subgoals", None)
-    if subgoals:  # belongs to the environment, and stays with it in a saved agent
-        merged["env_kwargs"] = {**(merged.get("env_kwargs") or {}), "subgoals": subgoals}
-    run = _run_keys(merged, task, path)
-    return RunConfig(algo=algo, task=task, config=config, model=merged, **run)
-
-
-def _run_keys(merged: Plain, task: str, path: Path) -> Plain:
-    """Take the keys of the run out of merged settings; null stands for a key's default, as it does for a setting.
-
-    :raises ConfigError: without a number of steps, which has no default
-    """
-    found = {key: merged.pop(key) for key in RUN if key in merged}
-    if "n_timesteps" not in found:
+    if "n_timesteps" not in merged:
         raise ConfigError(
             f"neither section {task} nor section default of {path} gives n_timesteps; your file replaces the shipped "
             "one as a whole, so start from a copy of that"
         )
-    if found["n_timesteps"] is None:
+    return _run_of(RunConfig(algo, task, config, 0), merged, f"--hyperparams or in {path}")
+
+
+def changed(run: RunConfig, change: PlainMapping, where: str) -> RunConfig:
+    """A configuration with other settings.
+
+    :param change: as a section of a file, merged into the present settings
+    :param where: where the change was found, for messages
+    :raises ConfigError: if the number of steps is null
+    """
+    env_kwargs = dict(run.env_kwargs)
+    of_run = {"n_timesteps": run.n_timesteps, "n_envs": run.n_envs, "env_kwargs": env_kwargs}
+    present = {**run.model, "subgoals": env_kwargs.pop("subgoals", None), **of_run}
+    return _run_of(run, merge(present, change), where)
+
+
+def _run_of(run: RunConfig, settings: Plain, where: str) -> RunConfig:
+    """The run of settings that are complete; null stands for a key's default, as it does for a setting.
+
+    Subgoals belong to the environment, and stay with it in a saved agent.
+
+    :raises ConfigError: if the number of steps is null, which has no default
+    """
+    model = dict(settings)
+    subgoals = model.pop("subgoals", None)
+    kept = {key: value for key in RUN if (value := model.pop(key, None)) is not None}
+    if "n_timesteps" not in kept:
         raise ConfigError(
-            f"n_timesteps must be a number of environment steps, got null in --hyperparams or in {path}; leave it out "
-            "there to have the task's"
+            f"n_timesteps must be a number of environment steps, got null in {where}; leave it out there to have the "
+            "task's"
         )
-    return {key: value for key, value in found.items() if value is not None}
+    if subgoals:
+        kept["env_kwargs"] = {**kept.get("env_kwargs", {}), "subgoals": subgoals}
+    return RunConfig(run.algo, run.task, run.config, model=model, **kept)
 
 
 def ablations_of(task: str, config: str | None = None) -> list[str]:

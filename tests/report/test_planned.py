@@ -8,12 +8,10 @@ from pathlib import Path
 import pytest
 from made_up_runs import fake_run
 
-from sb3_tbc import train
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.report.planned import N_EVAL_EPISODES, eval_freq_of, missing_table
+from sb3_tbc.report.planned import missing_table
 from sb3_tbc.report.runs import load_results
 from sb3_tbc.reproduce import jobs
-from sb3_tbc.train import default_eval_freq
 
 
 def test_rows_of_a_plan_may_have_options_of_their_own(tmp_path: Path) -> None:
@@ -71,9 +69,6 @@ def test_runs_made_otherwise_than_planned_do_not_count(tmp_path: Path) -> None:
     plan = tmp_path / "campaign.yml"
     plan.write_text("{first_seed: 0, runs: [{task: Pendulum, seeds: 4, methods: [tbc-hrl]}]}")
     assert missing_table(tmp_path, load_results(tmp_path))[1][2] == "1 of 4"
-    assert planned["eval_freq"] == default_eval_freq(200_000) == eval_freq_of(200_000)
-    assert default_eval_freq(30) == eval_freq_of(30)
-    assert train.N_EVAL_EPISODES == N_EVAL_EPISODES
 
 
 def test_plans_that_evaluate_a_task_at_other_steps_are_refused(tmp_path: Path) -> None:

@@ -94,6 +94,31 @@ def test_a_value_reaches_all_its_keys() -> None:
     assert run.model["low"]["tau"] == 0.0139
 
 
+@pytest.mark.parametrize(
+    ("label", "n_envs", "env_kwargs"),
+    [
+        ({"env_kwargs": None}, 3, {"subgoals": {"low": [3.0], "thresholds": 0.1}}),
+        ({"n_envs": None}, 1, {"a": 1, "subgoals": {"low": [3.0], "thresholds": 0.1}}),
+        ({"subgoals.thresholds": 0.2}, 3, {"a": 1, "subgoals": {"low": [3.0], "thresholds": 0.2}}),
+        ({"subgoals": None, "env_kwargs.b": 2}, 3, {"a": 1, "b": 2}),
+    ],
+)
+def test_a_label_may_hold_keys_of_the_run(label: Any, n_envs: int, env_kwargs: Any) -> None:
+    given = {"env_kwargs": {"a": 1}, "n_envs": 3, "subgoals": {"thresholds": 0.1, "low": [3.0]}}
+    run = load_config("tbc-hrl", "Other-v0", overrides=given)
+    changed = apply(build_space({"x": {"choices": {"other": label}}}), {"x": "other"}, run)
+    assert (changed.n_envs, changed.env_kwargs, changed.model) == (n_envs, env_kwargs, run.model)
+    with pytest.raises(ConfigError, match="n_timesteps must be a number of environment steps, got null in the search"):
+        apply(build_space({"x": {"choices": {"none": {"n_timesteps": None}}}}), {"x": "none"}, run)
+
+
+def test_a_threshold_of_subgoals_can_be_searched() -> None:
+    run = load_config("tbc-hrl", "Other-v0", overrides={"subgoals": {"thresholds": 0.1}})
+    space = build_space({"subgoals.thresholds": {"low": 0.05, "high": 0.5}})
+    assert project(space, run) == {"subgoals.thresholds": 0.1}
+    assert apply(space, {"subgoals.thresholds": 0.3}, run).env_kwargs == {"subgoals": {"thresholds": 0.3}}
+
+
 def test_a_schedule_is_written_as_text() -> None:
     run = load_config("tbc-hrl", "UR5Reacher", "paper")
     space = build_space(load_space("tbc-hrl", "UR5Reacher"))
