@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 
-from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.aliases import Plain
 from sb3_tbc.report.runs import BEGIN_ALIKE, OURS, Results, Run, reference_of, row_of, shipped, with_defaults
+from sb3_tbc.settings import flat
 from sb3_tbc.tasks import TASKS
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.schema import CONFIG_CLASSES
@@ -97,14 +98,6 @@ def unequal_conditions(results: Results) -> dict[str, dict[str, list[str]]]:
         lines = {method: differences(runs, rows[OURS]) for method, runs in rows.items()}
         found[task] = {method: said for method, said in lines.items() if said}
     return {task: rows for task, rows in found.items() if rows}
-
-
-def flat(settings: PlainMapping, prefix: str = "") -> Plain:
-    """Settings of all levels under dotted names."""
-    found: Plain = {}
-    for name, value in settings.items():
-        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return found
 
 
 @cache

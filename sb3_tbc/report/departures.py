@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.report.comparisons import common_threshold, convergence_gain, difference_of
-from sb3_tbc.report.conditions import differences, flat
+from sb3_tbc.report.conditions import differences
 from sb3_tbc.report.runs import OURS, Results, Run, read_table
+from sb3_tbc.settings import flat
 from sb3_tbc.zoo.config import load_config
 
 MEASUREMENTS = "measurements.yml"

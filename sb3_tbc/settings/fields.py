@@ -81,6 +81,14 @@ def plain(value: object) -> Any:
     return value
 
 
+def flat(settings: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    """Plain data of all sections under dotted names."""
+    found: dict[str, object] = {}
+    for name, value in settings.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return found
+
+
 # ------------------------------------------------------------------------------------------------- checking
 
 

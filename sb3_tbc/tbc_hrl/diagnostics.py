@@ -15,6 +15,7 @@ from stable_baselines3.common.logger import HParam, TensorBoardOutputFormat
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.settings import flat
 from sb3_tbc.smdp.hindsight import HighLevelSteps
 from sb3_tbc.smdp.options import Episode
 
@@ -78,18 +79,9 @@ def record_settings(model: BaseAlgorithm, settings: PlainMapping) -> None:
     if getattr(model, "_settings_told_to", None) is logger:
         return
     model._settings_told_to = logger  # type: ignore[attr-defined]
-    told = HParam({"algorithm": type(model).__name__, **_dotted(settings)}, dict.fromkeys(METRICS, 0.0))
+    dotted = {name: x if isinstance(x, bool | int | float) else str(x) for name, x in flat(settings).items()}
+    told = HParam({"algorithm": type(model).__name__, **dotted}, dict.fromkeys(METRICS, 0.0))
     logger.record("hparams", told, exclude=("stdout", "log", "json", "csv"))
-
-
-def _dotted(settings: PlainMapping, prefix: str = "") -> dict[str, bool | str | float | int | None]:
-    flat: dict[str, bool | str | float | int | None] = {}
-    for name, value in settings.items():
-        if isinstance(value, dict):
-            flat |= _dotted(value, f"{prefix}{name}.")
-        else:
-            flat[f"{prefix}{name}"] = value if isinstance(value, bool | int | float) else str(value)
-    return flat
 
 
 class ProgressBar(Protocol):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +11,7 @@ from injection import differences, recorded, run, tensors, the_run
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.zoo.algorithms import algorithm
 from sb3_tbc.zoo.callbacks import SuccessEvalCallback
+from sb3_tbc.zoo.config import parse_overrides
 from sb3_tbc.zoo.environments import make_envs
 
 TASK = "faulty:FaultyCorridor-v0"
@@ -65,7 +65,7 @@ def by_python(root: Path, algo: str, n_envs: int, compile: bool, way: Way = "loa
 def _learned(folder: Path, algo: str, n_envs: int, compile: bool, steps: list[int], way: Way) -> dict[str, Any]:
     folder.mkdir(parents=True)
     env = make_envs(TASK, n_envs, 5)
-    arguments = _nested(settings(algo, compile))
+    arguments = parse_overrides(settings(algo, compile))
     model: Any = algorithm(algo)("MultiInputPolicy", env, seed=0, **arguments)
     for part, count in enumerate(steps):
         if part and way == "loaded":
@@ -76,15 +76,6 @@ def _learned(folder: Path, algo: str, n_envs: int, compile: bool, steps: list[in
         watch = SuccessEvalCallback(make_envs(TASK, 1, 9), 2 * sum(steps) // 4, 1, csv_path=folder / "evaluations.csv")
         model.learn(count, callback=watch, reset_num_timesteps=not part)
     return contents_of(model, folder)
-
-
-def _nested(given: list[str]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for setting in given:
-        name, _, value = setting.partition(":")
-        level, dot, key = name.rpartition(".")
-        (found.setdefault(level, {}) if dot else found)[key] = json.loads(value)
-    return found
 
 
 def contents_of(model: Any, folder: Path) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from sb3_tbc.tbc_hrl.config import FlatConfig, HACConfig, HiTSConfig, TBCConfig
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.level_config import HighConfig, LowConfig, LowPolicyConfig
 from sb3_tbc.zoo import schema
-from sb3_tbc.zoo.config import load_config, parse_overrides
+from sb3_tbc.zoo.config import load_config, nested, parse_overrides
 from sb3_tbc.zoo.settings_page import settings_markdown, settings_text
 
 ALL = {"tbc-hrl": TBCConfig, "hits": HiTSConfig, "hac": HACConfig, "sac": FlatConfig}
@@ -182,16 +182,10 @@ NONSENSE: dict[str, list[Any]] = {
 }
 
 
-def nested(name: str, value: Any) -> dict[str, Any]:
-    for key in reversed(name.split(".")):
-        value = {key: value}
-    return value
-
-
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in NONSENSE.items() for value in values])
 def test_nonsense_is_one_clear_error(name: str, value: Any) -> None:
     with pytest.raises(ConfigError) as told:
-        TBCHRL("MultiInputPolicy", Corridor(), **nested(name, value))
+        TBCHRL("MultiInputPolicy", Corridor(), **nested({name: value}))
     first, *others = str(told.value).splitlines()
     assert not others
     assert name.split(".")[-1] in first
@@ -200,7 +194,7 @@ def test_nonsense_is_one_clear_error(name: str, value: Any) -> None:
 @pytest.mark.parametrize(("name", "value"), [(n, v) for n, vs in NONSENSE.items() for v in vs if not callable(v)])
 def test_nonsense_in_a_file_or_command_is_told_before_anything_is_written(name: str, value: Any) -> None:
     def read_and_build() -> None:
-        model = load_config("tbc-hrl", "Other-v0", overrides=nested(name, value)).model
+        model = load_config("tbc-hrl", "Other-v0", overrides=nested({name: value})).model
         TBCConfig.from_dict({key: value for key, value in model.items() if key != "policy"})
 
     with pytest.raises(ConfigError):
