@@ -1,7 +1,8 @@
-"""Types of the arrays that cross the borders between modules."""
+"""Arrays that cross the borders between modules: their types, and how those of several parts are named together."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -27,3 +28,13 @@ Indices = NDArray[np.intp]
 
 Arrays = dict[str, NDArray[Any]]
 """Arrays by name, as they are written to files."""
+
+
+def put_under(owner: str, arrays: Mapping[str, AnyArray]) -> Arrays:
+    """Arrays under the name of their owner, ``owner.name``."""
+    return {f"{owner}.{name}": array for name, array in arrays.items()}
+
+
+def taken_from(owner: str, arrays: Mapping[str, AnyArray]) -> Arrays:
+    """Those of many arrays that :func:`put_under` named, under their own names."""
+    return {name.removeprefix(f"{owner}."): x for name, x in arrays.items() if name.startswith(f"{owner}.")}

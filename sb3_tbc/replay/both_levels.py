@@ -7,7 +7,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import NamedTuple, NoReturn
 
-from sb3_tbc.arrays import AnyArray, Arrays
+from sb3_tbc.arrays import AnyArray, Arrays, put_under, taken_from
 from sb3_tbc.files import write_arrays
 from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
@@ -16,15 +16,11 @@ MORE = "running"
 """Prefix of arrays in the file that belong to neither buffer."""
 
 
-class _BothLevels(NamedTuple):
-    high: OptionReplayBuffer
-    low: SubgoalReplayBuffer
-
-
-class Replay(_BothLevels):
+class Replay(NamedTuple):
     """The replay buffers of both levels."""
 
-    __slots__ = ()
+    high: OptionReplayBuffer
+    low: SubgoalReplayBuffer
 
     def __getattr__(self, name: str) -> NoReturn:
         """Say where to look: agents of SB3 have one buffer."""
@@ -37,8 +33,8 @@ class Replay(_BothLevels):
 
         :param more: arrays to write into the same file
         """
-        states = {name: buffer.get_state() for name, buffer in self._asdict().items()} | {MORE: more}
-        write_arrays(path, {f"{name}.{key}": x for name, state in states.items() for key, x in state.items()})
+        high, low = (put_under(name, buffer.get_state()) for name, buffer in self._asdict().items())
+        write_arrays(path, high | low | put_under(MORE, more))
 
     def load(self, path: str | pathlib.Path | io.BufferedIOBase) -> Arrays:
         """Read what :meth:`save` wrote; only plain arrays are read, never pickled objects.
@@ -49,8 +45,7 @@ class Replay(_BothLevels):
         arrays = read_arrays(path)
         try:
             for name, buffer in self._asdict().items():
-                names = [key for key in arrays if key.startswith(f"{name}.")]
-                buffer.set_state({key.removeprefix(f"{name}."): arrays[key] for key in names})
+                buffer.set_state(taken_from(name, arrays))
         except (KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path} is no saved replay buffer of such an agent: {error!r}") from error
-        return {k.removeprefix(f"{MORE}."): arrays[k] for k in arrays if k.startswith(f"{MORE}.")}
+        return taken_from(MORE, arrays)

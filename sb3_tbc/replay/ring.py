@@ -86,10 +86,7 @@ class RingBuffer(BaseBuffer):
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """One batch in SB3's form."""
-        batch = LevelBatch(*(part[0] for part in self.sample_burst(1, batch_size)))
-        return ReplayBufferSamples(
-            batch.observations, batch.actions, batch.next_observations, batch.dones, batch.rewards, batch.discounts
-        )
+        return self._get_samples(self.rng.integers(0, self.size(), batch_size))
 
     def _get_samples(self, batch_inds: NDArray[np.intp], env: VecNormalize | None = None) -> ReplayBufferSamples:
         parts = LevelBatch(*(th.from_numpy(part).to(self.device) for part in self._rows(batch_inds)))

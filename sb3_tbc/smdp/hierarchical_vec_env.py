@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices
+from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices, put_under, taken_from
 from sb3_tbc.errors import HierarchyError
 from sb3_tbc.smdp.episode_limit import (
     ANNOUNCE,
@@ -143,8 +143,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
 
     def get_state(self) -> Arrays:
         """Live options and running episodes, as plain arrays; the environments themselves are not among them."""
-        recorded = {f"recorder.{name}": array for name, array in self._recorder.get_state().items()}
-        return {**recorded, **{f"clock.{name}": getattr(self.clock, name).copy() for name in self.clock.fields}}
+        clock = {name: getattr(self.clock, name).copy() for name in self.clock.fields}
+        return put_under("recorder", self._recorder.get_state()) | put_under("clock", clock)
 
     def set_state(self, state: Mapping[str, AnyArray], observation: GoalObservation) -> FloatArray:
         """Restore what :meth:`get_state` gave.
@@ -152,11 +152,9 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         :param observation: what the environments show now
         :return: what the low level sees
         """
-        parts = {name.partition("."): array for name, array in state.items()}
-        self._recorder.set_state({name: x for (owner, _, name), x in parts.items() if owner == "recorder"})
-        for (owner, _, name), array in parts.items():
-            if owner == "clock":
-                getattr(self.clock, name)[:] = array
+        self._recorder.set_state(taken_from("recorder", state))
+        for name, array in taken_from("clock", state).items():
+            getattr(self.clock, name)[:] = array
         self._announce(self._everywhere)
         self._hold(self.clock.ended(observation) & (self.clock.elapsed > 0) & self._last_option, observation)
         self.guard.go_on(observation)

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import MultiInputPolicy
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.arrays import Arrays
+from sb3_tbc.arrays import Arrays, put_under, taken_from
 from sb3_tbc.files import write_arrays
 from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.both_levels import MORE
@@ -292,7 +292,7 @@ class FlatSAC(PlainAlgorithm, SAC):
         arrays: Plain = dict(buffer.parts())
         rows = buffer.buffer_size if buffer.full else buffer.pos
         arrays = {name: array[:rows] for name, array in arrays.items()}
-        more = {f"{MORE}.{name}": array for name, array in (learning_state or self.learning_state()).items()}
+        more = put_under(MORE, learning_state or self.learning_state())
         held = {"_start": buffer._current_ep_start, "pos": buffer.pos, "full": buffer.full}
         write_arrays(path, {**arrays, **held, **more})
 
@@ -310,8 +310,7 @@ class FlatSAC(PlainAlgorithm, SAC):
             buffer.take_over(arrays)
         except (KeyError, TypeError, IndexError) as error:
             raise ValueError(f"{path} is no saved replay buffer of such an agent: {error!r}") from error
-        more = [name for name in arrays if name.startswith(f"{MORE}.")]
-        self._resumed = {name.removeprefix(f"{MORE}."): arrays[name] for name in more}
+        self._resumed = taken_from(MORE, arrays)
         if truncate_last_traj and not resume.can_go_on(self, self._resumed):
             self.close_running_episodes()
 

@@ -13,7 +13,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.arrays import AnyArray, Arrays
+from sb3_tbc.arrays import AnyArray, Arrays, put_under, taken_from
 from sb3_tbc.level.actors import NDBCActor
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.both_levels import Replay
@@ -82,7 +82,7 @@ def get_state(learning: LearningState) -> Arrays:
     if learning.collector is not None and isinstance(learning.collector.env.venv, GoalVecEnv):
         plain["episodes"], actions = _running(learning.collector.env.venv)
         arrays |= actions
-        arrays |= {f"collector.{name}": array for name, array in learning.collector.get_state().items()}
+        arrays |= put_under("collector", learning.collector.get_state())
     return {**arrays, "plain": np.array(json.dumps(plain))}
 
 
@@ -92,7 +92,7 @@ def set_state(learning: LearningState, state: Mapping[str, AnyArray]) -> bool:
     Then the log says that the run continues, but not exactly as the saved one would have. If the environments cannot be
     brought back to their state, everything else is restored and they begin new episodes; the log says that, too.
     """
-    plain = json.loads(str(state["plain"])) if "plain" in state else {}
+    plain = _plain(state)
     if plain.get("timesteps") != learning.num_timesteps:
         saved = plain.get("timesteps", "an unknown number of")
         logger.warning(
@@ -116,14 +116,19 @@ def set_state(learning: LearningState, state: Mapping[str, AnyArray]) -> bool:
     return True
 
 
+def _plain(state: Mapping[str, AnyArray]) -> Plain:
+    """What a state holds besides arrays; nothing where there is no state."""
+    plain: Plain = json.loads(str(state["plain"])) if "plain" in state else {}
+    return plain
+
+
 def _relive(collector: Collector, plain: PlainMapping, state: Mapping[str, AnyArray]) -> None:
     venv, starts = collector.env.venv, plain.get("episodes", [])
     if not isinstance(venv, GoalVecEnv) or len(starts) != venv.num_envs:
         logger.warning(NOT_KNOWN)
         return
     observation = venv.relive(_episodes(starts, state))
-    held = {name.partition(".")[2]: array for name, array in state.items() if name.startswith("collector.")}
-    if not collector.set_state(held, observation):
+    if not collector.set_state(taken_from("collector", state), observation):
         logger.warning(ELSEWHERE)
         collector.reset()
 
@@ -155,13 +160,13 @@ def get_flat_state(model: OffPolicyAlgorithm) -> Arrays:
     arrays: Arrays = {"numpy": np.asarray(keys), "torch": th.get_rng_state().numpy()}
     if isinstance(model.env, GoalVecEnv) and isinstance(model._last_obs, dict):
         plain["episodes"], actions = _running(model.env)
-        arrays |= actions | {f"last.{key}": np.array(part) for key, part in model._last_obs.items()}
+        arrays |= actions | put_under("last", {key: np.array(part) for key, part in model._last_obs.items()})
     return {**arrays, "plain": np.array(json.dumps(plain))}
 
 
 def can_go_on(model: OffPolicyAlgorithm, state: Mapping[str, AnyArray]) -> bool:
     """Whether a saved run's episodes can be continued."""
-    plain = json.loads(str(state["plain"])) if "plain" in state else {}
+    plain = _plain(state)
     known = isinstance(model.env, GoalVecEnv) and len(plain.get("episodes", ())) == model.n_envs
     return known and plain["timesteps"] == model.num_timesteps
 
@@ -175,9 +180,10 @@ def set_flat_state(model: OffPolicyAlgorithm, env: VecEnv, state: Mapping[str, A
     if not can_go_on(model, state) or not isinstance(env, GoalVecEnv):
         logger.warning(NOT_KNOWN)
         return False
-    plain = json.loads(str(state["plain"]))
+    plain = _plain(state)
     seen = env.relive(_episodes(plain["episodes"], state))
-    if not all(np.array_equal(seen[key], state[f"last.{key}"]) for key in seen):
+    last = taken_from("last", state)
+    if not all(np.array_equal(seen[key], last[key]) for key in seen):
         logger.warning(ELSEWHERE)
         model._last_obs = env.reset()  # type: ignore[assignment]
         return False
