@@ -63,5 +63,5 @@ class LabelledBuffer(FixedBuffer):
 
 def labelled_level(label: float, coef: float, compile: bool = False) -> SACLevel:
     level = make_level(make_batches(), compile, label_coef=coef, ent_coef=0.01)
-    level.attach(LabelledBuffer(make_batches(), label))
+    level.replay_buffer = LabelledBuffer(make_batches(), label)
     return level

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from torch import nn
 from sb3_tbc.arrays import FloatArray, FloatType
 from sb3_tbc.level.actors import GaussianHead, GRUActor, GRUNet, MLPActor, NDBCActor
 from sb3_tbc.level.policies import LevelActor, LevelPolicy
-from sb3_tbc.level.storage import Block
+from sb3_tbc.level.storage import Block, in_one_piece
 
 
 def _relu(x: FloatArray) -> FloatArray:
@@ -115,21 +115,10 @@ class FrozenGRU:
 
 def _as_array(block: Block) -> FloatArray:
     """A block of at most two dimensions as one array, without a copy if its parameters lie in flat storage."""
-    flat = _in_one_piece(block.parameters)
+    flat = in_one_piece(block.parameters)
     if flat is None:  # a copied policy, not yet in flat storage
         return np.concatenate([p.detach().numpy() for p in block.parameters])
-    return flat.reshape(block.shape)
-
-
-def _in_one_piece(parameters: Sequence[th.Tensor]) -> FloatArray | None:
-    """Parameters that lie one after another as one array ``(n,)`` that shares their memory; None if they do not."""
-    first = parameters[0].detach()
-    end = first.data_ptr()
-    for parameter in parameters:
-        if parameter.data_ptr() != end:
-            return None
-        end += parameter.numel() * parameter.element_size()
-    return first.as_strided(((end - first.data_ptr()) // first.element_size(),), (1,)).numpy()
+    return flat.numpy().reshape(block.shape)
 
 
 def freeze(actor: LevelActor, dtype: FloatType = np.float32) -> FrozenNet:
@@ -162,8 +151,8 @@ class Weights:
     def note(self) -> None:
         """Remember the parameters as they are."""
         self._places = [p.data_ptr() for p in self._parameters]
-        flat = _in_one_piece(self._parameters)
-        self._arrays = [p.detach().numpy() for p in self._parameters] if flat is None else [flat]
+        flat = in_one_piece(self._parameters)
+        self._arrays = [p.detach().numpy() for p in (self._parameters if flat is None else [flat])]
         self._noted = [array.copy() for array in self._arrays]
 
     def changed(self) -> bool:
@@ -205,13 +194,7 @@ class FrozenActor:
         deterministic: bool | NDArray[np.bool_],
         rng: np.random.Generator,
     ) -> tuple[FloatArray, FloatArray]:
-        """Unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``.
-
-        :param observations: ``(n, observation_dim)`` float32
-        :param states: ``(n, state_dim)`` float32
-        :param deterministic: the squashed mean instead of a sample, for all rows or for those of a mask ``(n,)``
-        :param rng: source of the noise
-        """
+        """See :meth:`ActingLevel.act`."""
         outputs, next_states = self._current()(observations, states)
         dim = self._dim
         bounded = np.minimum(np.maximum(outputs, self._lowest), self._highest)

@@ -146,10 +146,6 @@ class SACLevel(SAC):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_update", "acting"]
 
-    def attach(self, replay_buffer: BurstBuffer) -> None:
-        """Learn from this replay buffer from now on."""
-        self.replay_buffer = replay_buffer  # type: ignore[assignment]
-
     @property
     def compiled(self) -> bool:
         """Whether the last updates ran as a compiled graph."""

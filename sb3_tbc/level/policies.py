@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Any, TypeVar
 
 from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.sac.policies import LOG_STD_MAX, LOG_STD_MIN, SACPolicy
@@ -16,6 +17,7 @@ from sb3_tbc.level.actors import GRUActor, MemoryActor, MLPActor, NDBCActor
 from sb3_tbc.level.critics import LevelCritic
 
 LevelActor = MLPActor | NDBCActor | GRUActor
+AnyActor = TypeVar("AnyActor", bound=BasePolicy)
 
 
 class LevelPolicy(SACPolicy):
@@ -118,7 +120,7 @@ class LevelPolicy(SACPolicy):
         return LevelCritic(negative=negative, norm=norm, **kwargs).to(self.device)
 
 
-def copy_actor(actor: LevelActor) -> LevelActor:
+def copy_actor(actor: AnyActor) -> AnyActor:
     """A copy of an actor without its optimizer, not trained by gradients."""
     optimizer = actor.__dict__.pop("optimizer", None)
     try:

@@ -26,6 +26,17 @@ def linear_layers(module: nn.Module) -> list[nn.Linear]:
     return [layer for layer in module.modules() if isinstance(layer, nn.Linear)]
 
 
+def in_one_piece(parameters: Sequence[th.Tensor]) -> th.Tensor | None:
+    """Parameters that lie one after another as one tensor ``(n,)`` that shares their memory; None if they do not."""
+    first = parameters[0].detach()
+    end = first.data_ptr()
+    for parameter in parameters:
+        if parameter.data_ptr() != end:
+            return None
+        end += parameter.numel() * parameter.element_size()
+    return first.as_strided(((end - first.data_ptr()) // first.element_size(),), (1,))
+
+
 class FlatParameters:
     """One vector that holds a network's parameters; the network's modules are made to share its memory.
 
@@ -55,12 +66,8 @@ class FlatParameters:
 
     def is_aliased(self) -> bool:
         """Whether the modules still share the vector's memory; copying or moving a policy ends that."""
-        start = self.vector.data_ptr()
-        for p in self._parameters:
-            if p.data_ptr() != start:
-                return False
-            start += p.numel() * p.element_size()
-        return True
+        flat = in_one_piece(self._parameters)
+        return flat is not None and flat.data_ptr() == self.vector.data_ptr()
 
     def sync(self) -> None:
         """Copy the modules' values if they no longer share the vector's memory, and share it again."""

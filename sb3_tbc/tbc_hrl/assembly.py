@@ -6,7 +6,6 @@ import logging
 import math
 from typing import NamedTuple, cast
 
-import torch as th
 from gymnasium import spaces
 
 from sb3_tbc.aliases import Plain
@@ -149,21 +148,18 @@ def _given_bounds(level: LevelConfig) -> ValueBounds | None:
     return None if isinstance(level.target_bounds, str) else ValueBounds(*level.target_bounds)
 
 
-def make_high_level(
-    config: TBCConfig, ends: LevelSpaces, seed: int, device: th.device, bounds: ValueBounds | None
-) -> SACLevel:
+def make_high_level(config: TBCConfig, ends: LevelSpaces, seed: int, bounds: ValueBounds | None) -> SACLevel:
     """The level that chooses subgoals and time budgets."""
     policy_kwargs = config.high.policy_kwargs.to_kwargs()
     if policy_kwargs["negative_critic"] is None:
         policy_kwargs["negative_critic"] = not config.bonus_beyond_cost
-    return _make_level("high", config, config.high, ends, policy_kwargs, seed, device, bounds)
+    return _make_level("high", config, config.high, ends, policy_kwargs, seed, bounds)
 
 
 def make_low_level(
     config: TBCConfig,
     ends: LevelSpaces,
     seed: int,
-    device: th.device,
     bounds: ValueBounds | None,
     views: LevelViews,
 ) -> SACLevel:
@@ -179,7 +175,7 @@ def make_low_level(
         policy_kwargs["gru"] = {"hidden_size": policy_kwargs["gru"], "input_scale": views.low_scale().tolist()}
     if policy_kwargs["negative_critic"] is None:
         policy_kwargs["negative_critic"] = config.low_reward == "step"
-    return _make_level("low", config, config.low, ends, policy_kwargs, seed, device, bounds)
+    return _make_level("low", config, config.low, ends, policy_kwargs, seed, bounds)
 
 
 def _make_level(
@@ -189,7 +185,6 @@ def _make_level(
     ends: LevelSpaces,
     policy_kwargs: Plain,
     seed: int,
-    device: th.device,
     bounds: ValueBounds | None,
 ) -> SACLevel:
     actor_rate = level.actor_learning_rate
@@ -206,7 +201,6 @@ def _make_level(
         target_entropy=level.target_entropy,
         policy_kwargs={**policy_kwargs, "critic_norm": level.critic_norm},
         seed=seed,
-        device=device,
         compile=config.compile,
         name=name,
         label_coef=config.duration_loss_coef if name == "high" else 0.0,
@@ -224,7 +218,6 @@ def make_high_buffer(
     config: TBCConfig,
     ends: LevelSpaces,
     seed: int,
-    device: th.device,
     high: SACLevel,
     views: LevelViews,
     rules: OptionRules,
@@ -238,7 +231,6 @@ def make_high_buffer(
         config.high.buffer_size,
         ends.observation,
         ends.action,
-        device=device,
         seed=seed,
         context=None if teacher is None else views.subgoals,
         teacher=teacher,
@@ -249,7 +241,6 @@ def make_low_buffer(
     config: TBCConfig,
     ends: LevelSpaces,
     seed: int,
-    device: th.device,
     low: SACLevel,
     views: LevelViews,
     reward: LowLevelReward,
@@ -268,7 +259,6 @@ def make_low_buffer(
         state_dim=low.state_dim,
         gamma=own.gamma,
         n_hindsight_goals=config.n_hindsight_goals if own.n_hindsight_goals is None else own.n_hindsight_goals,
-        device=device,
         seed=seed,
         reward=reward,
         hindsight=strategy if config.low_reward == "step" else "timed",

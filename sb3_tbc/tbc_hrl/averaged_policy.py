@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping
 from typing import Any
 
 import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, MultiInputPolicy
+
+from sb3_tbc.level.policies import copy_actor
 
 
 class AveragedPolicy(MultiInputPolicy):
@@ -21,9 +22,7 @@ class AveragedPolicy(MultiInputPolicy):
 
     def _build(self, lr_schedule: Schedule) -> None:
         super()._build(lr_schedule)
-        self.average_actor = copy.deepcopy(self.actor)
-        self.average_actor.requires_grad_(False)
-        self.average_actor.set_training_mode(False)
+        self.average_actor = copy_actor(self.actor)
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> object:
         """Load weights in place, see torch; where they hold no average, it begins at the actor."""

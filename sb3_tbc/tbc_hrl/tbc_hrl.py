@@ -192,8 +192,8 @@ class TBCHRL(TwoLevelSaving):
         low_spaces = LevelSpaces(self.views.low_space(), spaces.Box(-1.0, 1.0, actions.shape, np.float32))
         high_bounds = assembly.make_high_bounds(config, self.high_reward, self.rules, self.reward_range)
         low_bounds = assembly.make_low_bounds(config, self.low_level_reward)
-        self.high = assembly.make_high_level(config, high_spaces, seeds[1], self.device, high_bounds)
-        self.low = assembly.make_low_level(config, low_spaces, seeds[2], self.device, low_bounds, self.views)
+        self.high = assembly.make_high_level(config, high_spaces, seeds[1], high_bounds)
+        self.low = assembly.make_low_level(config, low_spaces, seeds[2], low_bounds, self.views)
         self.reachability = assembly.make_reachability(config, subgoals, self.rules, seeds[6])
         self.schedule = assembly.make_schedule(config, self.views, self.rules, self.reachability)
         self._make_replay(high_spaces, low_spaces, seeds[3], seeds[4])
@@ -207,13 +207,12 @@ class TBCHRL(TwoLevelSaving):
         """Empty replay buffers for both levels, and what fills them."""
         config = self.config
         self.replay_buffer = Replay(
-            assembly.make_high_buffer(config, high_spaces, high_seed, self.device, self.high, self.views, self.rules,
-                                      self.reachability),
-            assembly.make_low_buffer(config, low_spaces, low_seed, self.device, self.low, self.views,
-                                     self.low_level_reward),
-        )  # fmt: skip
-        self.high.attach(self.replay_buffer.high)
-        self.low.attach(self.replay_buffer.low)
+            assembly.make_high_buffer(
+                config, high_spaces, high_seed, self.high, self.views, self.rules, self.reachability
+            ),
+            assembly.make_low_buffer(config, low_spaces, low_seed, self.low, self.views, self.low_level_reward),
+        )
+        self.high.replay_buffer, self.low.replay_buffer = self.replay_buffer  # type: ignore[assignment]
         self.store = EpisodeStore(
             self.replay_buffer, self.views, self.rules, self.high_reward, self.low_level_reward,
             assembly.hindsight_settings(config), self.rng,
