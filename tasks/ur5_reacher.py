@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -12,7 +13,7 @@ import numpy as np
 from sb3_tbc.aliases import Plain
 from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
 
-from .base import Array
+from .base import Array, GoalTask
 from .history import FrameHistory
 from .mujoco_rendering import ASSETS, GOAL_RGBA, Scene
 from .mujoco_task import MujocoTask
@@ -120,7 +121,79 @@ SKELETON = (
 """Points along the arm: body, place in its frame."""
 
 
-class UR5Reacher(MujocoTask):
+class ArmTask(GoalTask):
+    """The reaching task, whichever engine moves the arm."""
+
+    metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 33}
+    max_episode_steps = 600
+    action_bound = (3.15, 5.0, 3.15)
+    goal_low = (-2 * math.pi,) * 3
+    goal_high = (2 * math.pi,) * 3
+    goal_tolerance = (math.radians(10.0),) * 3
+    velocity_entries = (3, 4, 5)
+
+    def __init__(
+        self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
+    ) -> None:
+        super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
+        self._history = FrameHistory(N_FRAMES, 6) if observation == "paper" else None
+
+    @property
+    def frame_dim(self) -> int:
+        """Angles and velocities."""
+        return 6
+
+    @abstractmethod
+    def _joints(self) -> tuple[list[float], list[float]]:
+        """Angles and velocities."""
+
+    def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
+        local_scale = np.array([TYPICAL_ANGLE] * 3 + [MAX_SPEED] * 3)
+        bound = np.array([2 * math.pi] * 3 + [MAX_SPEED] * 3)
+        subgoals = SubgoalSpace(
+            low=-bound,
+            high=bound,
+            thresholds=(math.radians(10.0),) * 3 + (2.0,) * 3,
+            achieved=_subgoal,
+            local=_local,
+            local_scale=local_scale,
+            names=("pan", "lift", "elbow", "pan_velocity", "lift_velocity", "elbow_velocity"),
+        )
+        return np.tile(local_scale, N_FRAMES if self.layout == "paper" else 1), np.full(3, math.pi), subgoals
+
+    def subgoals_without_velocities(self) -> SubgoalSpace:
+        """The joint angles alone; the low level does not see the velocities either."""
+        whole, first = self.subgoals, slice(3)
+        return SubgoalSpace(
+            whole.low[first], whole.high[first], whole.thresholds[first], _achieved_goal, _angles,
+            whole.local_scale[first], whole.names[first],
+        )  # fmt: skip
+
+    def _sample_goal(self) -> Sequence[float]:
+        """Draw a desired configuration (pan, lift, elbow) that keeps elbow and wrist clear of the floor."""
+        rng = self.np_random
+        while True:
+            pan = rng.uniform(-math.pi, math.pi)
+            lift, elbow = rng.uniform(-math.pi / 4, 0.0), rng.uniform(-math.pi / 4, math.pi / 4)
+            elbow_height = BASE_HEIGHT - UPPER_ARM * math.sin(lift)
+            wrist_height = elbow_height - FOREARM * math.sin(lift + elbow)
+            if abs(pan) > math.pi / 4 and elbow_height > 0.05 and wrist_height > 0.15:
+                return [pan, lift, elbow]
+
+    def _sample_start(self) -> tuple[Array, Array]:
+        pan = self.np_random.uniform(-math.pi / 8, math.pi / 8)
+        return np.array([pan, *START]), np.zeros(3)
+
+    def _observe(self, first: bool) -> tuple[Array, list[float]]:
+        angles, speeds = self._joints()
+        frame = angles + speeds
+        achieved = [math.fmod(q, 2 * math.pi) for q in angles]
+        if self._history is None:
+            return np.array(frame), achieved
+        return self._history.reset(frame) if first else self._history.push(frame), achieved
+
+
+class UR5Reacher(ArmTask, MujocoTask):
     """The UR5 reaching task of the HAC and HiTS benchmarks: three joints driven by velocity servos, gravity, a floor.
 
     Servo torque is ``10 (ctrl - qd)``, joint damping 10 acts besides; one control step is 15 simulator steps of 2 ms.
@@ -143,46 +216,9 @@ class UR5Reacher(MujocoTask):
     xml: ClassVar[str] = MODEL
     drawn_xml: ClassVar[str | None] = DRAWN_MODEL
     frame_skip: ClassVar[int] = 15
-    metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 33}
-    max_episode_steps = 600
-    action_bound = (3.15, 5.0, 3.15)
-    goal_low = (-2 * math.pi,) * 3
-    goal_high = (2 * math.pi,) * 3
-    goal_tolerance = (math.radians(10.0),) * 3
-    velocity_entries = (3, 4, 5)
 
-    def __init__(
-        self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
-    ) -> None:
-        super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
-        self._history = FrameHistory(N_FRAMES, 6) if observation == "paper" else None
-
-    @property
-    def frame_dim(self) -> int:
-        """Angles and velocities."""
-        return 6
-
-    def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
-        return describe_arm(N_FRAMES if self.layout == "paper" else 1)
-
-    def subgoals_without_velocities(self) -> SubgoalSpace:
-        """The joint angles alone."""
-        return angles_of_arm(self.subgoals)
-
-    def _sample_goal(self) -> Sequence[float]:
-        return sample_arm_goal(self.np_random)
-
-    def _sample_start(self) -> tuple[Array, Array]:
-        pan = self.np_random.uniform(-math.pi / 8, math.pi / 8)
-        return np.array([pan, *START]), np.zeros(3)
-
-    def _observe(self, first: bool) -> tuple[Array, list[float]]:
-        angles: list[float] = self._qpos.tolist()
-        frame = angles + self._qvel.tolist()
-        achieved = [math.fmod(q, 2 * math.pi) for q in angles]
-        if self._history is None:
-            return np.array(frame), achieved
-        return self._history.reset(frame) if first else self._history.push(frame), achieved
+    def _joints(self) -> tuple[list[float], list[float]]:
+        return self._qpos.tolist(), self._qvel.tolist()
 
     def _make_scene(self, model: mujoco.MjModel) -> Scene:
         return Scene(model, (640, 480), lookat=(0.0, 0.0, 0.32), distance=2.3, azimuth=150.0, elevation=-25.0)
@@ -197,46 +233,6 @@ class UR5Reacher(MujocoTask):
         canvas.outline(points, SUBGOAL, 4.0, closed=False)
         for point in points:
             canvas.ring(point, 6.0, SUBGOAL)
-
-
-def describe_arm(n_frames: int) -> tuple[Array, Array, SubgoalSpace]:
-    """Scales and subgoal space of the reaching task, whichever engine moves the arm.
-
-    :param n_frames: frames of angles and velocities in the observation
-    :return: observation scale, goal scale, subgoal space
-    """
-    local_scale = np.array([TYPICAL_ANGLE] * 3 + [MAX_SPEED] * 3)
-    bound = np.array([2 * math.pi] * 3 + [MAX_SPEED] * 3)
-    subgoals = SubgoalSpace(
-        low=-bound,
-        high=bound,
-        thresholds=(math.radians(10.0),) * 3 + (2.0,) * 3,
-        achieved=_subgoal,
-        local=_local,
-        local_scale=local_scale,
-        names=("pan", "lift", "elbow", "pan_velocity", "lift_velocity", "elbow_velocity"),
-    )
-    return np.tile(local_scale, n_frames), np.full(3, math.pi), subgoals
-
-
-def angles_of_arm(whole: SubgoalSpace) -> SubgoalSpace:
-    """The subgoal space of the reaching task without its velocities, which the low level does not see either."""
-    first = slice(3)
-    return SubgoalSpace(
-        whole.low[first], whole.high[first], whole.thresholds[first], _achieved_goal, _angles, whole.local_scale[first],
-        whole.names[first],
-    )  # fmt: skip
-
-
-def sample_arm_goal(rng: np.random.Generator) -> list[float]:
-    """Draw a desired configuration (pan, lift, elbow) that keeps elbow and wrist clear of the floor."""
-    while True:
-        pan = rng.uniform(-math.pi, math.pi)
-        lift, elbow = rng.uniform(-math.pi / 4, 0.0), rng.uniform(-math.pi / 4, math.pi / 4)
-        elbow_height = BASE_HEIGHT - UPPER_ARM * math.sin(lift)
-        wrist_height = elbow_height - FOREARM * math.sin(lift + elbow)
-        if abs(pan) > math.pi / 4 and elbow_height > 0.05 and wrist_height > 0.15:
-            return [pan, lift, elbow]
 
 
 def _achieved_goal(observation: GoalObservation) -> FloatArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -14,13 +13,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_tbc.aliases import Plain
-from sb3_tbc.smdp.spaces import SubgoalSpace
-
 from .base import Array
-from .history import FrameHistory
 from .replayed import ReplayedTask
-from .ur5_reacher import N_FRAMES, START, UR5Reacher, angles_of_arm, describe_arm, sample_arm_goal
+from .ur5_reacher import ArmTask, UR5Reacher
 
 TIME_STEP = 0.002
 SUB_STEPS = 15
@@ -63,7 +58,7 @@ URDF_JOINTS = (  # name, origin, rpy, axis
 )
 
 
-class UR5ReacherBullet(ReplayedTask):
+class UR5ReacherBullet(ArmTask, ReplayedTask):
     """UR5Reacher with the dynamics of PyBullet; observations, actions, goals and subgoals are the same.
 
     Links have the same shapes and inertias. The servo torque ``10 (ctrl - qd)`` and the joint damping are computed as
@@ -73,37 +68,15 @@ class UR5ReacherBullet(ReplayedTask):
     :raises ImportError: without PyBullet, naming the extra that installs it
     """
 
-    metadata: ClassVar[Plain] = UR5Reacher.metadata
     _not_copied: ClassVar[tuple[str, ...]] = (*ReplayedTask._not_copied, "_client", "_twin")
-    max_episode_steps = UR5Reacher.max_episode_steps
-    action_bound = UR5Reacher.action_bound
-    goal_low, goal_high = UR5Reacher.goal_low, UR5Reacher.goal_high
-    goal_tolerance = UR5Reacher.goal_tolerance
-    velocity_entries = UR5Reacher.velocity_entries
 
     def __init__(
         self, *, observation: str = "paper", legacy_quirks: bool = False, render_mode: str | None = None
     ) -> None:
         self._engine = self._load_engine()
         super().__init__(observation=observation, legacy_quirks=legacy_quirks, render_mode=render_mode)
-        self._history = FrameHistory(N_FRAMES, 6) if observation == "paper" else None
         self._twin: UR5Reacher | None = None
         self._new_world()
-
-    @property
-    def frame_dim(self) -> int:
-        """Angles and velocities."""
-        return 6
-
-    def _describe(self) -> tuple[Array, Array, SubgoalSpace]:
-        return describe_arm(N_FRAMES if self.layout == "paper" else 1)
-
-    def subgoals_without_velocities(self) -> SubgoalSpace:
-        """The joint angles alone."""
-        return angles_of_arm(self.subgoals)
-
-    def _sample_goal(self) -> Sequence[float]:
-        return sample_arm_goal(self.np_random)
 
     def _state_shapes(self) -> dict[str, tuple[int, ...]]:
         return {"qpos": (3,), "qvel": (3,)}
@@ -143,9 +116,9 @@ class UR5ReacherBullet(ReplayedTask):
     def _restart(self, state: dict[str, Array]) -> None:
         if self._client < 0:  # closed in the meantime
             self._new_world()
-        start = np.array([self.np_random.uniform(-math.pi / 8, math.pi / 8), *START])
+        angles, speeds = self._sample_start()
         self._record.clear()  # an episode begins from the world as it was built
-        self._start([*state.get("qpos", start), *state.get("qvel", np.zeros(3))])
+        self._start([*state.get("qpos", angles), *state.get("qvel", speeds)])
 
     def _begin(self, start: list[float]) -> None:
         bullet, client = self._engine, self._client
@@ -160,7 +133,6 @@ class UR5ReacherBullet(ReplayedTask):
             self._sub_step(command)
 
     def _joints(self) -> tuple[list[float], list[float]]:
-        """Angles and velocities."""
         states = self._engine.getJointStates(self._arm, range(3), physicsClientId=self._client)
         return [joint[0] for joint in states], [joint[1] for joint in states]
 
@@ -178,13 +150,6 @@ class UR5ReacherBullet(ReplayedTask):
             self._arm, (0, 1, 2), bullet.TORQUE_CONTROL, forces=torque, physicsClientId=client
         )
         bullet.stepSimulation(physicsClientId=client)
-
-    def _observe(self, first: bool) -> tuple[Array, list[float]]:
-        angles, speeds = self._joints()
-        achieved = [math.fmod(q, 2 * math.pi) for q in angles]
-        if self._history is None:
-            return np.array(angles + speeds), achieved
-        return self._history.reset(angles + speeds) if first else self._history.push(angles + speeds), achieved
 
     def task_state(self) -> dict[str, Array]:
         """``qpos`` and ``qvel`` of the three joints."""
