@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_tbc.aliases import Env, Plain, Space
 from sb3_tbc.benchmark.floor import gemm_rate, products
@@ -28,6 +29,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.level.compilation import compiler_problem
 from sb3_tbc.ndbc.network import SYNAPSES
 from sb3_tbc.tbc_hrl import TBCHRL
+from sb3_tbc.tbc_hrl.config import TBCConfig
 from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import RunConfig, load_config
 from sb3_tbc.zoo.environments import make_envs, resolve_env
@@ -47,14 +49,6 @@ ROW_LIMIT = 50_000
 
 Figures = Plain
 Result = tuple[list[str], Figures]
-
-
-class Contender(NamedTuple):
-    """Something that learns: ``learn(steps)`` goes on for that many environment steps, ``done()`` counts them."""
-
-    name: str
-    learn: Callable[[int], object]
-    done: Callable[[], int]
 
 
 def one_core() -> None:
@@ -79,15 +73,15 @@ def ours(task: str, n_envs: int | None = 1, config: str | None = None, **setting
     return agent
 
 
-def contenders(task: str, config: str | None = None) -> list[Contender]:
+def contenders(task: str, config: str | None = None) -> dict[str, BaseAlgorithm]:
     """TBC-HRL, SB3's SAC and, if installed, SBX's SAC, on the same task.
 
-    The flat agents get the low level's network sizes and batch size, one update for each pair of updates of TBC-HRL's
-    levels, and the observation as one flat vector, with which they are fastest.
+    The flat agents get the low level's network sizes and batch size, as many updates as it does, and the observation as
+    one flat vector, with which they are fastest.
     """
     model = ours(task, config=config)
     warm_up(model, 1000)
-    found = [Contender("TBC-HRL", lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)]
+    found: dict[str, BaseAlgorithm] = {"TBC-HRL": model}
     from stable_baselines3 import SAC
 
     kinds: Plain = {"SB3 SAC": SAC}
@@ -97,15 +91,13 @@ def contenders(task: str, config: str | None = None) -> list[Contender]:
     env_kwargs = load_config("tbc-hrl", task, config).env_kwargs
     for name, kind in kinds.items():
         env = gym.wrappers.FlattenObservation(gym.make(env_id, **env_kwargs))
-        found.append(_flat(name, kind, env, model))
+        found[name] = _flat(kind, env, model.config)
     return found
 
 
-def _flat(name: str, kind: Any, env: Env, model: TBCHRL) -> Contender:
-    settings, ratio = model.config.low.to_dict(), model.config.gradient_ratio
-    flat = kind(
-        "MlpPolicy",
-        env,
+def _flat(kind: type[BaseAlgorithm], env: Env, config: TBCConfig) -> BaseAlgorithm:
+    settings, ratio = config.low.to_dict(), config.updates_per_step(config.low)
+    arguments: Plain = dict(
         batch_size=settings["batch_size"],
         learning_starts=settings["batch_size"],
         buffer_size=settings["buffer_size"],
@@ -114,7 +106,7 @@ def _flat(name: str, kind: Any, env: Env, model: TBCHRL) -> Contender:
         policy_kwargs={"net_arch": list(settings["policy_kwargs"]["net_arch"])},
         seed=0,
     )
-    return Contender(name, lambda n: flat.learn(n, reset_num_timesteps=False), lambda: int(flat.num_timesteps))
+    return kind("MlpPolicy", env, **arguments)
 
 
 def warm_up(model: TBCHRL, steps: int) -> None:
@@ -132,22 +124,22 @@ class Speed(NamedTuple):
     steps: int
 
 
-def stretch(contender: Contender, steps: int) -> Speed:
-    """Learn for some steps."""
-    before, cpu, wall = contender.done(), time.process_time(), time.perf_counter()
-    contender.learn(steps)
-    return Speed(time.process_time() - cpu, time.perf_counter() - wall, contender.done() - before)
+def stretch(model: BaseAlgorithm, steps: int) -> Speed:
+    """Learn on for some steps."""
+    before, cpu, wall = model.num_timesteps, time.process_time(), time.perf_counter()
+    model.learn(steps, reset_num_timesteps=False)
+    return Speed(time.process_time() - cpu, time.perf_counter() - wall, int(model.num_timesteps - before))
 
 
 def speed(task: str, steps: int, rounds: int, config: str | None = None) -> Result:
     """Environment steps per second while learning, in turns; the first stretch of each is not counted."""
     found = contenders(task, config)
-    for contender in found:
-        stretch(contender, max(steps, 1000))
-    runs: dict[str, list[Speed]] = {contender.name: [] for contender in found}
+    for model in found.values():
+        stretch(model, max(steps, 1000))
+    runs: dict[str, list[Speed]] = {name: [] for name in found}
     for _ in range(rounds):
-        for contender in found:
-            runs[contender.name].append(stretch(contender, steps))
+        for name, model in found.items():
+            runs[name].append(stretch(model, steps))
     rows = {
         name: {
             "steps_per_cpu_second": statistics.median(s.steps / s.cpu for s in stretches),
@@ -187,16 +179,18 @@ def floor(task: str, steps: int, rounds: int, config: str | None = None) -> Resu
     runs = [profile(model, steps) for _ in range(rounds)]
     step = statistics.median(sum(run.values()) for run in runs)
     environment = statistics.median(run["environment"] for run in runs)
-    levels = {"high": model.config.high.batch_size, "low": model.config.low.batch_size}
-    done = {name: products(getattr(model, name), batch, 10 * rounds) for name, batch in levels.items()}
-    rate, ratio = gemm_rate(10 * rounds), model.config.gradient_ratio
-    own = ratio * sum(level.microseconds for level in done.values())
-    best = ratio * 1e6 * sum(level.flops for level in done.values()) / rate
+    levels = {"high": model.config.high, "low": model.config.low}
+    ratios = {name: model.config.updates_per_step(level) for name, level in levels.items()}
+    done = {name: products(getattr(model, name), level.batch_size, 10 * rounds) for name, level in levels.items()}
+    rate = gemm_rate(10 * rounds)
+    own = sum(ratios[name] * level.microseconds for name, level in done.items())
+    best = 1e6 * sum(ratios[name] * level.flops for name, level in done.items()) / rate
     figures: Figures = {
         "step": step, "environment": environment, "products": own, "products_at_best_rate": best,
         "gflops_per_second": rate / 1e9, "levels": {name: level._asdict() for name, level in done.items()},
     }  # fmt: skip
-    counts = ", ".join(f"{v.number} of {v.flops / 1e6:.1f} MFLOP on the {k} level" for k, v in done.items())
+    counts = [f"{v.number} of {v.flops / 1e6:.1f} MFLOP on the {k} level" for k, v in done.items()]
+    often = " and ".join(f"{ratio:g} of the {name} level" for name, ratio in ratios.items())
     lines = [
         f"| {task}, microseconds per step | environment | products, as fast as their shapes allow |"
         f" the same at {rate / 1e9:.0f} GFLOP/s | floor | a step | times the floor |",
@@ -204,7 +198,7 @@ def floor(task: str, steps: int, rounds: int, config: str | None = None) -> Resu
         f"| | {environment:.1f} | {own:.1f} | {best:.1f} | {environment + own:.1f} | {step:.1f} |"
         f" {step / (environment + own):.2f} |",
         "",
-        f"Products of an update: {counts}; {ratio:g} updates of each level per step.",
+        f"Products of an update: {', '.join(counts)}; updates per step: {often}.",
     ]
     return lines, figures
 
@@ -275,14 +269,13 @@ def fill(model: TBCHRL, steps: int) -> None:
 def growth(task: str, steps: int, rounds: int, config: str | None = None) -> Result:
     """CPU time per step as the buffers fill: nearly empty, then full."""
     model = ours(task, config=config)
-    contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)
     warm_up(model, steps)
     figures: Figures = {}
     for name in ("empty", "full"):
         if name == "full":
             fill(model, full_budget(task))
-            stretch(contender, steps)
-        stretches = [stretch(contender, steps) for _ in range(rounds)]
+            stretch(model, steps)
+        stretches = [stretch(model, steps) for _ in range(rounds)]
         figures[name] = {
             "rows": [buffer.size() for buffer in model.replay_buffer],
             "us_per_step": [1e6 * s.cpu / s.steps for s in stretches],
@@ -307,9 +300,8 @@ def n_envs(
     figures: Figures = {}
     for count in counts:
         model = ours(task, count, config)
-        contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)  # noqa: B023
         warm_up(model, steps)
-        runs = [stretch(contender, steps * count) for _ in range(rounds)]
+        runs = [stretch(model, steps * count) for _ in range(rounds)]
         figures[str(count)] = statistics.median(1e6 * s.cpu / s.steps for s in runs)
     lines = [f"| {task}, environments | {' | '.join(figures)} |", "|---" * (len(figures) + 1) + "|"]
     lines.append("| microseconds per environment step | " + " | ".join(f"{x:.0f}" for x in figures.values()) + " |")
@@ -348,11 +340,10 @@ def budget(task: str, steps: int, rounds: int, config: str | None = None) -> Res
     """Time of the full budget: CPU time per step with full buffers, times the steps of table 1."""
     model = ours(task, config=config, learning_starts=0)
     total = full_budget(task)
-    contender = Contender(task, lambda n: model.learn(n, reset_num_timesteps=False), lambda: model.num_timesteps)
-    stretch(contender, max(steps, 1000))
+    stretch(model, max(steps, 1000))
     fill(model, total)
-    stretch(contender, steps)
-    runs = [stretch(contender, steps) for _ in range(rounds)]
+    stretch(model, steps)
+    runs = [stretch(model, steps) for _ in range(rounds)]
     per_step = statistics.median(s.cpu / s.steps for s in runs)
     minutes = per_step * total / 60
     allowed = BUDGET_MINUTES.get(task)

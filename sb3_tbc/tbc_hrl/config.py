@@ -211,6 +211,10 @@ class TBCConfig(AgentConfig):
                 "policy_kwargs.negative_critic=True cannot learn: leave negative_critic out, or use a smaller bonus",
             )
 
+    def updates_per_step(self, level: LevelConfig) -> float:
+        """Updates of one of the levels per environment step."""
+        return float(self.gradient_ratio if level.gradient_ratio is None else level.gradient_ratio)
+
     @property
     def bonus_beyond_cost(self) -> bool:
         """Whether the completion bonus can make a decision's reward positive, for a task whose rewards never are.

@@ -30,7 +30,7 @@ from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
-from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
+from sb3_tbc.tbc_hrl.config import TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import (
     EpisodeDiagnostics,
     ProgressBar,
@@ -341,7 +341,8 @@ class TBCHRL(TwoLevelSaving):
         """
         for level, config in ((self.high, self.config.high), (self.low, self.config.low)):
             level.set_logger(self.logger)
-            name, few = level.log_prefix[:-1], self._updates_of(config, total_timesteps) < MIN_UPDATES_TO_COMPILE
+            name = level.log_prefix[:-1]
+            few = self.config.updates_per_step(config) * total_timesteps < MIN_UPDATES_TO_COMPILE
             compile = False if self.config.compile == "auto" and few else self.config.compile
             with described(bar, f"compiling the {name} level's update" if compile else ""):
                 seconds = level.prepare(config.batch_size, compile)
@@ -390,7 +391,7 @@ class TBCHRL(TwoLevelSaving):
         self._updated_at = self.num_timesteps
         levels = zip((self.high, self.low), self.replay_buffer, (self.config.high, self.config.low), strict=True)
         for level, buffer, config in levels:
-            updates = self._owed_updates(level.log_prefix, self._ratio_of(config) * steps)
+            updates = self._owed_updates(level.log_prefix, self.config.updates_per_step(config) * steps)
             if updates and buffer.size() >= config.batch_size:
                 self._owed[level.log_prefix] -= updates
                 level._current_progress_remaining = self._current_progress_remaining
@@ -410,13 +411,6 @@ class TBCHRL(TwoLevelSaving):
         """
         self._owed[name] = self._owed.get(name, 0.0) + more
         return int(self._owed[name])
-
-    def _updates_of(self, level: LevelConfig, steps: int) -> int:
-        """Number of updates of a level with these settings for a number of environment steps."""
-        return int(self._ratio_of(level) * steps)
-
-    def _ratio_of(self, level: LevelConfig) -> float:
-        return float(self.config.gradient_ratio if level.gradient_ratio is None else level.gradient_ratio)
 
     def dump_logs(self) -> None:
         """Write what was seen since the last time: SB3's keys, and per level what explains learning."""

@@ -116,11 +116,15 @@ def test_products_of_an_update_are_counted_and_the_level_is_left_alone():
 
 def test_floor_is_below_a_step(monkeypatch):
     level = {"batch_size": 8, "policy_kwargs": {"net_arch": [32, 32]}}
-    monkeypatch.setattr(benchmark_train, "ours", partial(benchmark_train.ours, high=level, low=level))
+    levels = {"high": level, "low": {**level, "gradient_ratio": 0.5}}
+    monkeypatch.setattr(benchmark_train, "ours", partial(benchmark_train.ours, **levels))
     monkeypatch.setattr(benchmark_train, "warm_up", WARM_UP)
     lines, figures = benchmark_train.floor("Pendulum", 200, 1)
     assert any("times the floor" in line for line in lines)
+    assert lines[-1].endswith("updates per step: 1 of the high level and 0.5 of the low level.")
     assert 0 < figures["environment"] + figures["products"] < figures["step"]
+    updates = [figures["levels"][name]["microseconds"] for name in ("high", "low")]
+    assert figures["products"] == pytest.approx(updates[0] + 0.5 * updates[1])
 
 
 def test_warming_up_ends_when_both_levels_learn():
