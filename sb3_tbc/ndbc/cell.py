@@ -158,7 +158,7 @@ class ConductanceCell(nn.Module):
     ) -> None:
         """Capacitances for time constants in ``ranges``: ``C = tau x conductance``, with every logistic half open."""
         capacitance = functional.softplus(self.raw_capacitance)
-        arrays = self._assemble(self.values(), self.synapse_currents())
+        arrays = self.arrays()
         s, n = self.n_sensory_synapsing, self.n_neurons
         released = arrays.from_inputs[:s, n:].sum(dim=0) + arrays.recurrent[:, n:].sum(dim=0)
         conductance = arrays.rest[n:] + 0.5 * released
@@ -224,9 +224,8 @@ class ConductanceCell(nn.Module):
         """The values with the capacitance that belongs to the form of its free parameter."""
         return value._replace(capacitance=self.raw_capacitance.exp()) if self.log_capacitance else value
 
-    def synapse_currents(self) -> th.Tensor:
+    def synapse_currents(self, value: ConductanceValues) -> th.Tensor:
         """``w E`` of every synapse; differentiable."""
-        value = self.values()
         return value.conductance * value.reversal * self.polarity
 
     def reversal(self, value: ConductanceValues) -> th.Tensor:
@@ -236,7 +235,7 @@ class ConductanceCell(nn.Module):
     def arrays(self) -> ConductanceArrays:
         """Masked conductances from the current free parameters; differentiable."""
         value = self.values()
-        return self._assemble(value, value.conductance * value.reversal * self.polarity)
+        return self._assemble(value, self.synapse_currents(value))
 
     def _assemble(self, value: ConductanceValues, weighted: th.Tensor) -> ConductanceArrays:
         """The arrays for positive quantities and each synapse's ``w E``."""

@@ -70,14 +70,18 @@ class ParameterCount(NamedTuple):
         return self.ndbc / self.mlp
 
 
+def mlp_parameters(sizes: Sequence[int]) -> int:
+    """Weights and biases of an MLP with these layer sizes, input and output included."""
+    return sum((before + 1) * after for before, after in itertools.pairwise(sizes))
+
+
 def count_parameters(net: NDBCNet, hidden: Sequence[int] = (64, 64)) -> ParameterCount:
     """Count trained parameters; what the wiring leaves out has none.
 
     :param net: the network
     :param hidden: widths of the MLP it replaces
     """
-    sizes = (net.n_inputs, *hidden, net.n_outputs)
-    mlp = sum((a + 1) * b for a, b in itertools.pairwise(sizes))
+    mlp = mlp_parameters([net.n_inputs, *hidden, net.n_outputs])
     return ParameterCount(
         sum(p.numel() for p in net.parameters()), mlp, net.wiring.n_synapses, net.wiring.n_inputs + net.state_dim
     )

@@ -73,11 +73,7 @@ class LeanCell(ConductanceCell):
         """Signed reversal potentials, one per synapse."""
         return th.where(self.synapse < 0, -value.reversal, value.reversal)
 
-    def arrays(self) -> ConductanceArrays:
-        """Masked conductances from the current free parameters; differentiable. ``w E`` is s itself."""
-        return self._assemble(self.values(), self.synapse)
-
-    def synapse_currents(self) -> th.Tensor:
+    def synapse_currents(self, value: ConductanceValues) -> th.Tensor:
         """``w E`` of every synapse: s itself."""
         return self.synapse
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise, product
+from itertools import product
 from typing import NamedTuple
 
 from stable_baselines3.common.torch_layers import get_actor_critic_arch
@@ -12,6 +12,7 @@ from stable_baselines3.common.torch_layers import get_actor_critic_arch
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.level.level import SACLevel
+from sb3_tbc.ndbc.diagnostics import mlp_parameters
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import RunConfig, merge
@@ -83,11 +84,6 @@ def _hidden(level: SACLevel) -> tuple[list[int], list[int]]:
 
 def _net_arch(level: str, pi: Sequence[int], qf: Sequence[int]) -> Plain:
     return {level: {"policy_kwargs": {"net_arch": {"pi": list(pi), "qf": list(qf)}}}}
-
-
-def mlp_parameters(sizes: Sequence[int]) -> int:
-    """Weights and biases of an MLP with these layer sizes, input and output included."""
-    return sum((before + 1) * after for before, after in pairwise(sizes))
 
 
 def _fit_actor(level: SACLevel, missing: int, total: int) -> Plain:
