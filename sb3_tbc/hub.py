@@ -13,7 +13,7 @@ from sb3_tbc.extras import require
 from sb3_tbc.outside import one_line
 
 if TYPE_CHECKING:
-    from sb3_tbc.zoo.algorithms import Agent
+    from sb3_tbc.tbc_hrl.evaluation import Agent
 
 MODEL, CARD = "model.zip", "README.md"
 HEAD = "---\nlibrary_name: stable-baselines3\ntags:\n- reinforcement-learning\n- stable-baselines3\n- sb3_tbc\n---\n"

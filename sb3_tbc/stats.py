@@ -63,10 +63,7 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     :param trials: episodes
     :raises ValueError: unless ``0 <= successes <= trials`` and ``trials > 0``
     """
-    if not 0 <= successes <= trials or trials <= 0:
-        raise ValueError(f"need 0 <= successes <= trials and trials > 0, got {successes} of {trials}")
-    interval = stats.binomtest(int(successes), int(trials)).proportion_ci(confidence, method="wilson")
-    return float(interval.low), float(interval.high)
+    return _proportion(successes, trials, confidence, "wilson")
 
 
 def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tuple[float, float]:
@@ -76,9 +73,13 @@ def clopper_pearson(successes: int, trials: int, confidence: float = 0.95) -> tu
     :param trials: episodes
     :raises ValueError: unless ``0 <= successes <= trials`` and ``trials > 0``
     """
+    return _proportion(successes, trials, confidence, "exact")
+
+
+def _proportion(successes: int, trials: int, confidence: float, method: str) -> tuple[float, float]:
     if not 0 <= successes <= trials or trials <= 0:
         raise ValueError(f"need 0 <= successes <= trials and trials > 0, got {successes} of {trials}")
-    interval = stats.binomtest(int(successes), int(trials)).proportion_ci(confidence, method="exact")
+    interval = stats.binomtest(int(successes), int(trials)).proportion_ci(confidence, method=method)
     return float(interval.low), float(interval.high)
 
 

@@ -10,8 +10,9 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_tbc.aliases import Env, Plain, Wrapper
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.smdp.goal_spaces import said_success
-from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
+from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
 from .goal_env_check import check_goal_env, goal_env_problems, name_of
 from .probe import Floats, Probe, run_probe

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
 from .base import Array
 from .box2d import box_fixture, circle_fixture, load_box2d

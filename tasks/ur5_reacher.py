@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.smdp.spaces import FloatArray, GoalObservation, SubgoalSpace
+from sb3_tbc.arrays import FloatArray
+from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
 from .base import Array, GoalTask
 from .history import FrameHistory

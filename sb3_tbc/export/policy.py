@@ -20,6 +20,7 @@ from sb3_tbc.level.actors import GRUActor, MemoryActor, NDBCActor
 from sb3_tbc.level.policies import LevelActor
 from sb3_tbc.ndbc.dissipative import DissipativeCell
 from sb3_tbc.ndbc.network import NDBCNet
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, width
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.scheduling import ReachRule
 
@@ -170,7 +171,7 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     :param task: name, for file names and comments
     :raises ConfigError: if a part of the model cannot be exported; the message names it
     """
-    layout, rules, subgoals = model.views, model.rules, model.views.subgoals
+    views, rules, subgoals = model.views, model.rules, model.views.subgoals
     if isinstance(model.schedule, ReachRule):
         raise ConfigError("an agent with duration='rule' cannot be exported: its windows come from another network")
     if rules.may_be_reconsidered:
@@ -179,9 +180,9 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
             "exports hold actors alone; load it with window_end='timed' to export it with windows that run to their end"
         )
     unit_time = None if model.schedule is None else model.schedule.unit
-    sizes = {f"n_{key}": _width(model, name) for key, name in GOAL_PARTS.items()}
-    probe = _Probe(sizes["n_observation"], sizes["n_achieved"])
-    needed = rules.window_end == "reached" or layout.relative_subgoals
+    n_observation, n_achieved, n_desired = (width(cast(spaces.Dict, model.observation_space), key) for key in GOAL_KEYS)
+    probe = _Probe(n_observation, n_achieved)
+    needed = rules.window_end == "reached" or views.relative_subgoals
     if subgoals.rotations and rules.window_end == "reached":
         raise ConfigError("window_end='reached' with subgoals that are compared by angle cannot be exported")
     high: LevelActor | _MLPActor = model.high.policy.average_actor
@@ -212,24 +213,16 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
         whole_budgets=rules.whole_budgets,
         event=subgoals.event,
         memory=model.config.memory,
-        achieved_in_observation=layout.achieved_in_observation,
-        relative_subgoals=layout.relative_subgoals,
-        remaining_time=layout.remaining_time,
+        achieved_in_observation=views.achieved_in_observation,
+        relative_subgoals=views.relative_subgoals,
+        remaining_time=views.remaining_time,
         fixed_budget=None if unit_time is None else float(rules.budget(np.array(unit_time))),
         action_low=actions.low.astype(np.float64),
         action_high=actions.high.astype(np.float64),
-        **sizes,
+        n_observation=n_observation,
+        n_achieved=n_achieved,
+        n_desired=n_desired,
     )
-
-
-GOAL_PARTS = {"observation": "observation", "achieved": "achieved_goal", "desired": "desired_goal"}
-
-
-def _width(model: TBCHRL, key: str) -> int:
-    space = model.observation_space
-    if not isinstance(space, spaces.Dict):
-        raise TypeError(f"expected an agent with dictionary observations, got {space}")
-    return int(np.prod(space[key].shape or ()))
 
 
 def action_box(model: TBCHRL) -> spaces.Box:

@@ -78,7 +78,7 @@ def command(argv: Sequence[str]) -> int:
         effort = Effort(args.n_random, args.max_alone, args.synapses)
         found = investigate(model, units, space, info["task"], episodes, effort)
         print(describe(found), end="")
-        _write(args, found, model, info, episodes)
+        _write(args, found, model, info, space, episodes)
     finally:
         episodes.close()
     return 0
@@ -92,9 +92,16 @@ def _space_of(model: TBCHRL, info: Plain) -> TaskSpace:
     return space_of(info["task"] if own else "", model.views.subgoals)
 
 
-def _write(args: argparse.Namespace, found: Findings, model: TBCHRL, info: Plain, episodes: HeldOutEpisodes) -> None:
+def _write(
+    args: argparse.Namespace,
+    found: Findings,
+    model: TBCHRL,
+    info: Plain,
+    space: TaskSpace,
+    episodes: HeldOutEpisodes,
+) -> None:
     """Write the files that were asked for."""
-    space, subgoals = _space_of(model, info), model.views.subgoals
+    subgoals = model.views.subgoals
     identity = {key: info[key] for key in ("task", "algo", "variant", "config", "seed")}
     if args.json is not None:
         about = {**identity, "n_timesteps": int(model.num_timesteps), "first_episode_seed": args.seed}

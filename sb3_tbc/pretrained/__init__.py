@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from sb3_tbc.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
-    from sb3_tbc.zoo.algorithms import Agent
+    from sb3_tbc.tbc_hrl.evaluation import Agent
 
 FOLDER = Path(__file__).parent
 PREFIX = "pretrained:"

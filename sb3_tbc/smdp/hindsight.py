@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.arrays import BoolArray, FloatArray
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.options import Episode, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
@@ -172,11 +173,7 @@ def hindsight_success(reached: FloatArray, subgoal: FloatArray, tolerance: float
 
 
 def _rows(episode: Episode, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
-    return {
-        "observation": episode.observation[rows],
-        "achieved_goal": episode.achieved_goal[rows],
-        "desired_goal": episode.desired_goal[rows],
-    }
+    return {key: getattr(episode, key)[rows] for key in GOAL_KEYS}
 
 
 def failed_tests(episode: Episode) -> BoolArray:

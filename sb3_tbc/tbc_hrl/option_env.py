@@ -6,13 +6,12 @@ import math
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.arrays import AnyArray, FloatArray
+from sb3_tbc.arrays import AnyArray, FloatArray, Indices
 from sb3_tbc.errors import EnvironmentFault, NonFiniteError
 from sb3_tbc.smdp.episode_limit import (
     ANNOUNCE,
@@ -31,8 +30,6 @@ from sb3_tbc.smdp.options import OptionClock
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.tbc_hrl.foreign_high import refuse_reconsidering
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
-
-Indices = NDArray[np.intp]
 
 
 class OptionEnv(CopyableVecEnvWrapper):

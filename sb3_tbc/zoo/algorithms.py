@@ -16,11 +16,11 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.tasks.foreign import ROBOTICS
 from sb3_tbc.tbc_hrl import HAC, TBCHRL, HiTS
 from sb3_tbc.tbc_hrl.archive import UntrustedError, read_bytes, read_data
+from sb3_tbc.tbc_hrl.evaluation import Agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.environments import make_envs
 
-Agent = TBCHRL | FlatSAC
 ALGORITHMS: dict[str, type[TBCHRL] | type[FlatSAC]] = {"tbc-hrl": TBCHRL, "hits": HiTS, "hac": HAC, "sac": FlatSAC}
 RUN_INFO = "run_info"
 """Attribute, and key in the ``.zip``, that describe a run: task, environment, variant, seed."""

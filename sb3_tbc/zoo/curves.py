@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 import time
-import zipfile
 from collections.abc import Collection
 from pathlib import Path
 
@@ -14,9 +13,11 @@ import numpy as np
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import Arrays
 from sb3_tbc.files import write_arrays
+from sb3_tbc.reading import read_arrays
 from sb3_tbc.tbc_hrl.evaluation import EvaluationResult
 from sb3_tbc.zoo.rows import RowsCallback
 
+COLUMNS = ("results", "ep_lengths", "successes")
 EVALUATION_EPISODES, MONITOR = "evaluations.npz", "train.monitor.csv"
 MOST_EPISODES = 200_000
 """Episodes of training that the monitor file holds at most, some 8 MB."""
@@ -40,7 +41,7 @@ class EvaluationEpisodes:
 
         :raises WriteError: if it cannot be written
         """
-        row = {"results": result.rewards, "ep_lengths": result.lengths, "successes": result.successes}
+        row = dict(zip(COLUMNS, (result.rewards, result.lengths, result.successes), strict=True))
         alike = {step: old for step, old in self._rows.items() if len(old["results"]) == len(result.rewards)}
         self._rows = {**alike, timesteps: row}
         if self.path is not None:
@@ -53,11 +54,10 @@ def _read(path: Path | None) -> dict[int, Arrays]:
     if path is None or not path.is_file():
         return {}
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in ("timesteps", "results", "ep_lengths", "successes")}
-        steps = arrays.pop("timesteps").tolist()
-        return {int(step): {name: array[i] for name, array in arrays.items()} for i, step in enumerate(steps)}
-    except (OSError, ValueError, KeyError, IndexError, TypeError, EOFError, zipfile.BadZipFile) as error:
+        arrays = read_arrays(path)
+        steps, columns = arrays["timesteps"].tolist(), {name: arrays[name] for name in COLUMNS}
+        return {int(step): {name: array[i] for name, array in columns.items()} for i, step in enumerate(steps)}
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
         logger.warning(f"{path} cannot be read and is begun anew: {error}")
         return {}
 

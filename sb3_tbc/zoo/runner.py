@@ -23,8 +23,8 @@ from sb3_tbc.errors import (
 from sb3_tbc.files import explained, locked, remove_stale_lock, save_atomic
 from sb3_tbc.outside import one_line
 from sb3_tbc.stopping import StopRequest
-from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
-from sb3_tbc.zoo.algorithms import RUN_INFO, Agent, build_model, load_model, read_zip
+from sb3_tbc.tbc_hrl.evaluation import Agent, evaluate_agent
+from sb3_tbc.zoo.algorithms import RUN_INFO, build_model, load_model, read_zip
 from sb3_tbc.zoo.callbacks import OptionTraceCallback, StopTraining, SuccessEvalCallback, TimedCheckpointCallback
 from sb3_tbc.zoo.checkpoints import find_checkpoint, keep_only, remove_checkpoints, save_checkpoint
 from sb3_tbc.zoo.config import RunConfig

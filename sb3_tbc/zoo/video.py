@@ -15,7 +15,7 @@ from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.files import temporary_beside
-from sb3_tbc.tasks.probe import said_success
+from sb3_tbc.smdp.goal_spaces import said_success
 from sb3_tbc.tasks.rendering import Overlay, with_caption
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import Agent
