@@ -93,6 +93,15 @@ def evaluate(
     return {**identity, "n_timesteps": int(model.num_timesteps), **summarise(result), "eval_seed": seed}
 
 
+FIGURES = {
+    "mean_length": "episode length   {:.1f} steps on average",
+    "mean_length_success": "  of successes   {:.1f} steps",
+    "subgoal_success": "subgoals reached {:.2f}  (share of options, mean over episodes)",
+    "mean_window": "option length    {:.1f} steps on average",
+}
+"""Figure of the result -> its line of the summary."""
+
+
 def describe(result: PlainMapping) -> str:
     """A few lines for a person; figures that an agent does not have (a flat one has no subgoals) are left out."""
     low, high = result["success_ci95"]
@@ -107,15 +116,6 @@ def describe(result: PlainMapping) -> str:
         if result[key] is not None:
             lines.append(text.format(result[key]))
     return "\n".join(lines)
-
-
-FIGURES = {
-    "mean_length": "episode length   {:.1f} steps on average",
-    "mean_length_success": "  of successes   {:.1f} steps",
-    "subgoal_success": "subgoals reached {:.2f}  (share of options, mean over episodes)",
-    "mean_window": "option length    {:.1f} steps on average",
-}
-"""Figure of the result -> its line of the summary."""
 
 
 def command(argv: Sequence[str]) -> int:

@@ -153,6 +153,10 @@ def _is_number(value: object) -> bool:
     )
 
 
+Shapes = list[tuple[str, tuple[int, ...] | None]]
+"""Names of the parts of an observation with their shapes."""
+
+
 def shapes_of(space: Space) -> Shapes:
     """The parts of a goal environment's observation with their shapes; none of another space."""
     return [(key, part.shape) for key, part in space.spaces.items()] if isinstance(space, spaces.Dict) else []
@@ -309,10 +313,6 @@ def receive_checked(workers: SubprocVecEnv, shapes: Shapes) -> VecEnvStepReturn:
         observations[index], reset_infos[index] = checked(observations[index], reset_infos[index], shapes)
     workers.reset_infos = reset_infos
     return _stacked(observations, workers), np.stack(rewards), np.stack(dones), infos
-
-
-Shapes = list[tuple[str, tuple[int, ...] | None]]
-"""Names of the parts of an observation with their shapes."""
 
 
 def checked(observation: VecEnvObs, info: Plain, shapes: Shapes) -> tuple[Arrays, Plain]:

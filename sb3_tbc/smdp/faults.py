@@ -130,6 +130,10 @@ def reset_or_name(venv: VecEnv) -> VecEnvObs:
         return venv.reset()
 
 
+NOT_RESET: dict[str, Any] = {"not reset": True}
+"""Stands for what the reset of an environment says, until it does."""
+
+
 @contextlib.contextmanager
 def named_reset(venv: VecEnv) -> Iterator[None]:
     """Name the environment that fails, dies or hangs while all of them are reset within the block.
@@ -150,10 +154,6 @@ def named_reset(venv: VecEnv) -> Iterator[None]:
         if NOT_RESET not in infos:
             raise
         raise fault(infos.index(NOT_RESET), 0, error) from error
-
-
-NOT_RESET: dict[str, Any] = {"not reset": True}
-"""Stands for what the reset of an environment says, until it does."""
 
 
 def _give_up(venv: VecEnv) -> None:

@@ -12,8 +12,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
 from sb3_tbc.aliases import Plain, Space
-from sb3_tbc.arrays import AnyArray
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import AnyArray, FloatArray
 
 GoalObservation = Mapping[str, AnyArray]
 """A goal environment's observation: ``observation``, ``achieved_goal``, ``desired_goal``, single or batched."""

@@ -168,12 +168,12 @@ def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu", trust
         raise ConfigError(f"cannot load {path} as {name}: {type(error).__name__}: {one_line(error)}") from error
 
 
-def load_two_levels(path: Path, env: VecEnv | None = None, device: str = "cpu", trust: bool = False) -> TBCHRL:
+def load_two_levels(path: Path, device: str = "cpu", trust: bool = False) -> TBCHRL:
     """Load an agent that has subgoals.
 
     :raises ConfigError: if it cannot be loaded or has only one level
     """
-    model = load_model(path, env, device, trust)
+    model = load_model(path, None, device, trust)
     if not isinstance(model, TBCHRL):
         raise ConfigError(f"{path} holds a flat agent; this command needs one with two levels")
     return model

@@ -193,16 +193,20 @@ def test_gradients_stay_finite_over_a_thousand_steps(seed: int, dynamics: str, s
     assert all(bool(th.isfinite(p.grad).all()) for p in (*net.parameters(), inputs, state))
 
 
-@given(SEEDS, st.integers(0, 40), st.floats(1e-3, 0.1))
-@settings(max_examples=15, deadline=None)
-def test_masked_synapses_stay_exactly_zero_and_polarity_is_kept(seed: int, updates: int, rate: float) -> None:
-    net = random_net(seed)
+def train(net: NDBCNet, updates: int, rate: float) -> None:
     optimizer = th.optim.AdamW(net.parameters(), lr=rate, weight_decay=0.1)
     for _ in range(updates):
         loss = (net(th.randn(32, 3))[0] - 1.0).square().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+
+
+@given(SEEDS, st.integers(0, 40), st.floats(1e-3, 0.1))
+@settings(max_examples=15, deadline=None)
+def test_masked_synapses_stay_exactly_zero_and_polarity_is_kept(seed: int, updates: int, rate: float) -> None:
+    net = random_net(seed)
+    train(net, updates, rate)
     arrays, n = net.cell.arrays(), net.state_dim
     sensory, recurrent = arrays.from_inputs[:3], arrays.recurrent
     wired = net.wiring.recurrent[: len(recurrent)]
@@ -224,12 +228,7 @@ def test_a_lean_synapse_is_one_number_and_missing_ones_stay_zero(
 ) -> None:
     layers = ("inter", "command", "motor") if reflexes else ("inter",)
     net = random_net(seed, synapses="lean", sensory_to=layers)
-    optimizer = th.optim.AdamW(net.parameters(), lr=rate, weight_decay=0.1)
-    for _ in range(updates):
-        loss = (net(th.randn(32, 3))[0] - 1.0).square().mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
+    train(net, updates, rate)
     arrays, n, wiring = net.cell.arrays(), net.state_dim, net.wiring
     pulled, conductance = arrays.recurrent.detach().split(n, dim=1)
     assert th.equal(pulled.abs(), conductance), "a reversal potential of +1 or -1"
