@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -35,6 +34,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tbc import TBCHRL
 from sb3_tbc.aliases import Plain
 from sb3_tbc.files import write_atomic
+from sb3_tbc.report.markdown import update_page
 from sb3_tbc.tbc_hrl.evaluation import evaluate_hierarchical
 from sb3_tbc.zoo.algorithms import build_model
 from sb3_tbc.zoo.config import load_config, parse_overrides
@@ -222,13 +222,6 @@ def text_of(found: Plain) -> str:
     return "\n\n".join(part for part in (learned(found), curves(found)) if part)
 
 
-def update(page: Path, text: str) -> None:
-    """Put the tables into the page, between its marks."""
-    old = page.read_text(encoding="utf-8")
-    new = re.sub(r"(<!-- foreign -->\n).*?(<!-- end -->)", lambda m: f"{m[1]}{text}\n{m[2]}", old, flags=re.DOTALL)
-    write_atomic(page, new)
-
-
 def main() -> None:
     """Compare; see the module's text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -253,7 +246,7 @@ def main() -> None:
     if args.output is None:
         print(text)
     else:
-        update(args.output, text)
+        update_page(args.output, text, ("<!-- foreign -->", "<!-- end -->"))
 
 
 def read(results: Path) -> Plain:

@@ -14,11 +14,11 @@ from pathlib import Path
 from typing import Any
 
 from sb3_tbc import train
-from sb3_tbc.files import write_atomic
 from sb3_tbc.interpret import command as interpret
 from sb3_tbc.interpret.findings import PAPER
 from sb3_tbc.interpret.page import SIMULATED
 from sb3_tbc.pretrained import pretrained_names
+from sb3_tbc.report.markdown import update_page
 from sb3_tbc.zoo.ledger import RunFolder
 
 ROOT = Path(__file__).parents[1]
@@ -72,8 +72,7 @@ def write_table() -> None:
         f"| *{PAPER['information_p90']:.2f}* | |"
     )
     rows += [_row(path.stem, json.loads(path.read_text())) for path in sorted(FIGURES.glob("*.json"))]
-    before, _, rest = PAGE.read_text(encoding="utf-8").partition(MARKS[0])
-    write_atomic(PAGE, f"{before}{MARKS[0]}\n" + "\n".join(rows) + f"\n{MARKS[1]}{rest.partition(MARKS[1])[2]}")
+    update_page(PAGE, "\n".join(rows), MARKS)
 
 
 def _row(name: str, figures: dict[str, Any]) -> str:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -31,6 +30,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from sb3_tbc import NDBCSAC
 from sb3_tbc.aliases import Env, Plain
 from sb3_tbc.files import write_atomic
+from sb3_tbc.report.markdown import update_page
 from sb3_tbc.stats import bootstrap_mean, welch_test
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -111,13 +111,6 @@ def _cell(curves: Sequence[Sequence[float]], steps: int, n_seeds: int) -> str:
     return f"{mean.mean:.0f} [{mean.low:.0f}, {mean.high:.0f}]"
 
 
-def update(page: Path, text: str) -> None:
-    """Put the table into the page, between its marks."""
-    old = page.read_text(encoding="utf-8")
-    new = re.sub(r"(<!-- table -->\n).*?(\n<!-- end -->)", lambda m: m[1] + text + m[2], old, flags=re.DOTALL)
-    write_atomic(page, new)
-
-
 def main() -> None:
     """Compare; see the module's text."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -139,7 +132,7 @@ def main() -> None:
     if args.output is None:
         print(text)
     else:
-        update(args.output, text)
+        update_page(args.output, text, ("<!-- table -->", "<!-- end -->"))
 
 
 if __name__ == "__main__":

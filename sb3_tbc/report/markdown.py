@@ -30,16 +30,16 @@ def _said(note: str) -> str:
     return f"{note}\n\n" if note else ""
 
 
-def update_page(path: Path, text: str) -> None:
-    """Replace the text between the result marks of a Markdown page.
+def update_page(path: Path, text: str, marks: tuple[str, str] = MARKS) -> None:
+    """Replace the text between two marks of a Markdown page.
 
     :raises ConfigError: if the page or its marks are missing, or it is no UTF-8
     """
     page = read_text(path)
-    before, begin, rest = page.partition(MARKS[0])
-    _, end, after = rest.partition(MARKS[1])
+    before, begin, rest = page.partition(marks[0])
+    _, end, after = rest.partition(marks[1])
     if not begin or not end:
-        raise ConfigError(f"{path} needs the lines {MARKS[0]} and {MARKS[1]} around the place for the tables")
+        raise ConfigError(f"{path} needs the lines {marks[0]} and {marks[1]} around the place for the tables")
     write_atomic(path, f"{before}{begin}\n{text}\n{end}{after}")
 
 
