@@ -1,6 +1,7 @@
-"""Making tasks in tests; those whose engine is not installed are skipped."""
+"""Making tasks in tests, and actions for them; tasks whose engine is not installed are skipped."""
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
 import sb3_tbc  # noqa: F401  (registers the tasks)
@@ -13,3 +14,8 @@ def make(task, layout="paper", **kwargs):
     if task in ENGINES:
         pytest.importorskip(ENGINES[task], reason=f"{task} needs {ENGINES[task]}, which is not installed")
     return gym.make(f"sb3_tbc/{task}-v0", observation=layout, **kwargs)
+
+
+def random_actions(env, n, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.uniform(env.action_space.low, env.action_space.high, (n, *env.action_space.shape)).astype(np.float32)

@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 import yaml
+from checks import said
 
 from sb3_tbc import evaluate, train
 from sb3_tbc.zoo.algorithms import load_model
@@ -40,14 +41,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(root: Path) -> RunFolder:
     return RunFolder.for_run(root, "Pendulum", "tbc-hrl", "custom", 5)
-
-
-def said(capsys: pytest.CaptureFixture[str]) -> str:
-    """Standard error, which must be one line without a traceback."""
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1, captured.err
-    assert "Traceback" not in captured.err
-    return captured.err
 
 
 def test_a_run_leaves_everything_behind(run: RunFolder) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from making import make
+from making import make, random_actions
 from sb3_tbc.tasks import TASKS
 
 WAYS = {
@@ -34,11 +34,6 @@ def state_of(env):
     return {name: array.tobytes() for name, array in env.unwrapped.task_state().items()}
 
 
-def actions_for(env, n, seed):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(env.action_space.low, env.action_space.high, (n, *env.action_space.shape)).astype(np.float32)
-
-
 @pytest.mark.parametrize("task", TASKS)
 @settings(max_examples=6, deadline=None)
 @given(
@@ -53,13 +48,13 @@ def test_a_copy_goes_on_exactly(task, way, layout, legacy, episodes, steps, seed
     env = make(task, layout, legacy_quirks=legacy, max_episode_steps=110)
     env.reset(seed=seed)
     for episode in range(episodes):
-        walk(env, actions_for(env, 30, seed + episode))
+        walk(env, random_actions(env, 30, seed + episode))
         env.reset()
-    before = actions_for(env, steps, seed + 9)
+    before = random_actions(env, steps, seed + 9)
     walk(env, before)
     twin = WAYS[way](env)
     assert state_of(twin) == state_of(env)
-    after = actions_for(env, 60, seed + 10)
+    after = random_actions(env, 60, seed + 10)
     first = walk(env, after)
     assert walk(twin, after) == first  # each has a random stream of its own, from the same state
 
@@ -69,10 +64,10 @@ def test_a_copy_goes_on_exactly(task, way, layout, legacy, episodes, steps, seed
 def test_a_copy_is_independent(task, way):
     env = make(task)
     env.reset(seed=1)
-    walk(env, actions_for(env, 5, 0))
+    walk(env, random_actions(env, 5, 0))
     before = state_of(env)
     twin = WAYS[way](env)
-    walk(twin, actions_for(twin, 20, 1))
+    walk(twin, random_actions(twin, 20, 1))
     assert state_of(env) == before
     assert state_of(twin) != before
     if names := env.unwrapped.dynamics_names:
@@ -81,7 +76,7 @@ def test_a_copy_is_independent(task, way):
         pairs = []
         for one in (env, same, changed):
             one.reset(seed=3)
-            pairs.append(walk(one, actions_for(env, 40, 2)))
+            pairs.append(walk(one, random_actions(env, 40, 2)))
         assert pairs[0] == pairs[1] != pairs[2]
 
 
@@ -92,9 +87,9 @@ def test_a_copy_before_the_first_reset_and_of_a_perturbed_task(task):
         fresh.step(np.zeros(fresh.action_space.shape))
     env = make(task, perturb={"observation_noise": 0.1, "action_delay": 3})
     env.reset(seed=5)
-    walk(env, actions_for(env, 10, 0))
+    walk(env, random_actions(env, 10, 0))
     twin = copy.deepcopy(env)
-    actions = actions_for(env, 20, 1)
+    actions = random_actions(env, 20, 1)
     assert walk(env, actions) == walk(twin, actions)
 
 

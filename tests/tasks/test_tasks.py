@@ -10,7 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from making import ENGINES, make
+from making import ENGINES, make, random_actions
 from sb3_tbc.tasks import TASKS
 from scripted_policies import Roll, episode_length, sail_late, servo
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
@@ -36,11 +36,6 @@ SIX = sorted(STATE_SIZE)
 layouts = pytest.mark.parametrize("layout", ["paper", "compact"])
 tasks = pytest.mark.parametrize("task", SIX)
 all_ids = pytest.mark.parametrize("task", [*SIX, "UR5ReacherBullet"])
-
-
-def random_actions(env, n, seed=0):
-    rng = np.random.default_rng(seed)
-    return rng.uniform(env.action_space.low, env.action_space.high, (n, *env.action_space.shape)).astype(np.float32)
 
 
 def equal(one, other):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from checks import assert_same
 from corridor import Corridor
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.monitor import Monitor
@@ -38,12 +39,6 @@ def contents(model: FlatSAC) -> dict[str, Any]:
     found |= {f"replay.{key}": part[:rows].copy() for key, part in buffer.observations.items()}
     found |= {"actions": buffer.actions[:rows].copy(), "ends": buffer.dones[:rows].copy()}
     return {**found, "updates": model._n_updates, "steps": model.num_timesteps, "episodes": model._episode_num}
-
-
-def assert_same(first: dict[str, Any], second: dict[str, Any]) -> None:
-    assert first.keys() == second.keys()
-    for key, value in first.items():
-        np.testing.assert_array_equal(second[key], value, err_msg=key)
 
 
 @pytest.mark.parametrize("n_envs", [1, 8])

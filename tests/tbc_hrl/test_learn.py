@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch as th
+from checks import assert_same
 from corridor import Corridor
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -35,12 +36,6 @@ def contents(model: TBCHRL) -> dict[str, Any]:
         found |= {f"{name}.replay.{key}": array[: buffer.size()].copy() for key, array in buffer.data.items()}
         found |= {f"{name}.updates": level._n_updates, f"{name}.rng": str(level.noise_rng.bit_generator.state)}
     return {**found, "rng": str(model.rng.bit_generator.state), "returns": [i["r"] for i in model.ep_info_buffer]}
-
-
-def assert_same(first: dict[str, Any], second: dict[str, Any]) -> None:
-    assert first.keys() == second.keys()
-    for key, value in first.items():
-        np.testing.assert_array_equal(second[key], value, err_msg=key)
 
 
 def in_chunks(model: TBCHRL, chunks: list[int]) -> TBCHRL:

@@ -17,6 +17,7 @@ import numpy as np
 import optuna
 import pytest
 import yaml
+from checks import said
 from optuna.trial import TrialState
 
 from sb3_tbc import train
@@ -46,14 +47,6 @@ NAME = "tbc-hrl-TunedCorridor-v0"
 
 def arguments(folder: Path, *more: str) -> list[str]:
     return ["--env", ENV, "--log-folder", str(folder), *more]
-
-
-def said(capsys: pytest.CaptureFixture[str]) -> str:
-    """Standard error, which must be one line without a traceback."""
-    captured = capsys.readouterr()
-    assert captured.err.count("\n") == 1, captured.err
-    assert "Traceback" not in captured.err
-    return captured.err
 
 
 def load(folder: Path, grace: int = 60) -> optuna.Study:
