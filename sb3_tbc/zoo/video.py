@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
@@ -14,7 +13,7 @@ from numpy.typing import NDArray
 from sb3_tbc.aliases import Env, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
-from sb3_tbc.files import temporary_beside
+from sb3_tbc.files import replacing
 from sb3_tbc.smdp.goal_spaces import said_success
 from sb3_tbc.tasks.rendering import Overlay, with_caption
 from sb3_tbc.tbc_hrl import TBCHRL
@@ -113,19 +112,14 @@ def record_video(model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: 
     :param n_episodes: number of episodes
     :param seed: episode ``i`` starts from ``seed + i``
     :raises ConfigError: if the file's name, the installation or the task do not allow it
+    :raises WriteError: if the file cannot be written
     """
     if path.suffix != ".mp4":
         raise ConfigError(f"a video's name must end in .mp4, got {path}")
     imageio = require("imageio.v2", extra="video", what="a film")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_beside(path)
     fps = frames_per_second(env)
-    try:
-        writer: _Writer
-        with imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
-            for episode in range(n_episodes):
-                for frame in film(model, env, seed + episode):
-                    writer.append_data(frame)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    writer: _Writer
+    with replacing(path) as temporary, imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
+        for episode in range(n_episodes):
+            for frame in film(model, env, seed + episode):
+                writer.append_data(frame)

@@ -11,7 +11,7 @@ import pytest
 from sb3_tbc.tasks.rendering import SUBGOAL
 
 from sb3_tbc import TBCHRL
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, WriteError
 from sb3_tbc.zoo.video import episode_frames, film, record_video
 
 ENV_ID = "sb3_tbc/Drawbridge-v0"
@@ -93,6 +93,8 @@ def test_the_file_is_written_whole(model: TBCHRL, tmp_path: Path) -> None:
     assert [p.name for p in path.parent.iterdir()] == ["a.mp4"]
     with pytest.raises(ConfigError, match=r"must end in \.mp4"):
         record_video(model, env, tmp_path / "a.gif")
+    with pytest.raises(WriteError, match=r"cannot write .*a\.mp4/b\.mp4"):
+        record_video(model, env, path / "b.mp4")
 
 
 def test_what_cannot_be_drawn_costs_one_line(model: TBCHRL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
