@@ -64,7 +64,8 @@ def step(observation: Array, achieved_goal: Array, desired_goal: Array, state: S
         state["membrane"] = potentials.astype(np.float32)
     state["elapsed"] += 1
     low, high = ARRAYS["action_low"].astype(np.float32), ARRAYS["action_high"].astype(np.float32)
-    return np.asarray(low + np.float32(0.5) * (_squash(mean, 1) + np.float32(1.0)) * (high - low)), state
+    action = low + np.float32(0.5) * (_squash(mean, 1) + np.float32(1.0)) * (high - low)
+    return np.minimum(action, high), state  # rounded, the sum may lie above the bound
 
 
 def _begin(observation: Array, achieved_goal: Array, desired_goal: Array, state: State) -> None:

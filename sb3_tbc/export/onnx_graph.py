@@ -93,7 +93,8 @@ def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
     unit = g.cast(_squash(g, mean, policy.mean_bounds[1]), TensorProto.FLOAT)
     share = g("Mul", g("Add", unit, g.constant(1.0)), g.constant(0.5))
     scaled = g("Mul", share, g.constant(policy.action_high.astype(np.float32) - policy.action_low.astype(np.float32)))
-    g("Add", g.constant(policy.action_low), scaled, name="action")
+    action = g("Add", g.constant(policy.action_low), scaled)
+    g("Min", action, g.constant(policy.action_high), name="action")  # rounded, the sum may lie above the bound
     g("Add", elapsed, g.constant(1.0, np.float64), name="next_elapsed")
     return _model(g, policy)
 

@@ -87,12 +87,14 @@ class UnitActions:
     """
 
     def __init__(self, space: spaces.Box) -> None:
-        self.low, self.width, self.dtype = space.low, space.high - space.low, space.dtype
+        self.low, self.high, self.dtype = space.low, space.high, space.dtype
+        self.width = space.high - space.low
         self.centre, self.half = 0.5 * (space.low + space.high), 0.5 * (space.high - space.low)
 
     def unscale(self, unit: AnyArray) -> AnyArray:
         """The environment's actions for unit ones, of the action space's type; exported code rounds the same way."""
-        actions = self.low + 0.5 * (unit + 1.0) * self.width
+        # rounded, low + (high - low) may lie above high, which environments that check their actions refuse
+        actions = np.minimum(self.low + 0.5 * (unit + 1.0) * self.width, self.high)
         return np.asarray(actions, dtype=self.dtype)
 
     def scale(self, actions: AnyArray) -> AnyArray:

@@ -117,6 +117,24 @@ def test_large_weights_do_not_part_them(case: str, kind: str, tmp_path: Path) ->
         assert result.windows >= 3
 
 
+@pytest.mark.parametrize("kind", ["numpy", "onnx", pytest.param("c", marks=needs_cc)])
+def test_actions_at_their_bounds_lie_in_the_space(kind: str, tmp_path: Path) -> None:
+    if kind == "onnx":
+        pytest.importorskip("onnxruntime")
+    low, high = np.float32(-4.75), np.float32(0.97)
+    assert low + (high - low) > high  # in single precision
+    env = gym.wrappers.RescaleAction(gym.make("sb3_tbc/Pendulum-v0"), low, high)
+    model = HAC("MultiInputPolicy", env, low={"policy_kwargs": {"mean_bound": None}}, compile=False)
+    with th.no_grad():
+        model.low.policy.average_actor.mu.bias += 100.0
+    model.low.refresh()
+    policy, path = extract(model), tmp_path / f"policy{sb3_tbc.export.command.SUFFIXES[kind]}"
+    sb3_tbc.export.command.WRITERS[kind](policy, path)
+    seen, _ = env.reset(seed=0)
+    assert model.predict(seen, deterministic=True)[0] == high
+    assert player(kind, path, policy).step(seen) == high
+
+
 def assert_every_format_agrees(model: TBCHRL, env: gym.Env, folder: Path) -> None:
     """A thousand steps of real episodes with window changes; the two closed forms beside each other too."""
     policy = extract(model)

@@ -129,7 +129,7 @@ void tbc_step(tbc_state *state, const float observation[TBC_OBSERVATION],
     tbc_low_mean(state->membrane, seen, closed_form, mean);
     for (i = 0; i < TBC_ACTION; ++i) {
         const float half = 0.5f * ((float)squash(mean[i], TBC_LOW_BOUND) + 1.0f);
-        action[i] = action_low[i] + half * (action_high[i] - action_low[i]);
+        action[i] = fminf(action_low[i] + half * (action_high[i] - action_low[i]), action_high[i]);
     }
     state->elapsed += 1;
 }

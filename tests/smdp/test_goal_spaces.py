@@ -1,0 +1,20 @@
+"""Unit actions in the environment's own units."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from sb3_tbc.smdp.goal_spaces import UnitActions
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_actions_lie_in_their_space(dtype: type[np.floating]) -> None:
+    ends = np.random.default_rng(0).uniform([-5.0, 0.0], [0.0, 5.0], (1000, 2)).round(2).astype(dtype)
+    space = spaces.Box(ends[:, 0], ends[:, 1], dtype=dtype)
+    unit = UnitActions(space)
+    for corner in (-1.0, 1.0):
+        actions = unit.unscale(np.full(1000, corner, dtype=np.float32))
+        assert space.contains(actions)
+        assert np.allclose(unit.scale(actions), corner, atol=1e-5)
