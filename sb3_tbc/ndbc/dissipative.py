@@ -105,20 +105,24 @@ class DissipativeCell(nn.Module):
     ) -> th.Tensor:
         """One sub-step of equation 20 for states ``(batch, n_neurons)``."""
         recurrent = self.enforced(arrays, step_terms)
-        return (state + step_terms * th.tanh(input_terms + state @ recurrent)) / (1.0 + step_terms * arrays.damping)
+        heard = state @ recurrent if recurrent.dim() == 2 else (state.unsqueeze(1) @ recurrent).squeeze(1)
+        return (state + step_terms * th.tanh(input_terms + heard)) / (1.0 + step_terms * arrays.damping)
 
     def enforced(self, arrays: DissipativeArrays, step_terms: th.Tensor) -> th.Tensor:
         """U, scaled down so that rho <= max_rho: ``||U|| <= (max_rho / ||(I + eta K)^-1|| - 1) / eta``.
 
         ``sqrt(||U||_1 ||U||_inf)`` stands for the spectral norm: never smaller, and cheap and differentiable.
+
+        :return: ``(N, N)``, or ``(batch, N, N)`` where sub-steps differ in length: a short one leaves less room
         """
         if self.max_rho is None:
             return arrays.recurrent
-        eta = step_terms.max()
+        eta = step_terms.amax(dim=-1)
         room = (self.max_rho * (1.0 + eta * arrays.damping.min()) - 1.0).clamp(min=0.0) / eta
         size = arrays.recurrent.abs()
         norm = (size.sum(dim=0).max() * size.sum(dim=1).max()).sqrt()
-        return arrays.recurrent * (room / (norm + 1e-12)).clamp(max=1.0)
+        share = (room / (norm + 1e-12)).clamp(max=1.0)
+        return arrays.recurrent * share[..., None, None]
 
     @th.no_grad()
     def certificate(self, dt: float) -> Certificate:

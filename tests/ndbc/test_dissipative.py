@@ -51,6 +51,17 @@ def test_neurons_hear_their_presynaptic_ones_only(seed: int) -> None:
     np.testing.assert_array_equal(np.sign(influence), net.wiring.recurrent)
 
 
+@pytest.mark.parametrize("rule", [{}, {"adaptive_step": {"half_step_check": True}}])
+def test_a_limit_of_rho_holds_for_each_length_of_step(rule: dict[str, object]) -> None:
+    """A sample's step does not depend on the steps beside it; a short one may not use the room of a long one."""
+    net = random_net(0, 3.0, dynamics="dissipative", max_rho=0.97, **rule)
+    lengths = th.tensor([0.0, 0.5, 1.0, 2.0])
+    inputs, state = th.zeros(4, 3), th.linspace(-1.0, 1.0, 4 * net.state_dim).view(4, -1)
+    together = net(inputs, state, interval=lengths)[1]
+    alone = [net(inputs[i : i + 1], state[i : i + 1], interval=lengths[i : i + 1])[1] for i in range(4)]
+    th.testing.assert_close(together, th.cat(alone), rtol=0.0, atol=1e-6)
+
+
 @pytest.mark.parametrize("sub_steps", [1, 3])
 @given(seed=SEEDS)
 @settings(max_examples=20, deadline=None)
