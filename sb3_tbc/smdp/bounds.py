@@ -65,7 +65,9 @@ def _decision_range(reward: HighLevelReward, rules: OptionRules, rewards: Reward
         lengths = geometric(reward.gamma_step, 1), geometric(reward.gamma_step, math.ceil(rules.dt_max))
         low, high = min(low * n for n in lengths), max(high * n for n in lengths)
         low, high = (x / reward.dt_ref - reward.decision_cost for x in (low, high))
-    shares = rules.dt_min / rules.dt_max, 1.0  # of the longest time budget
+    shares = [rules.dt_min / rules.dt_max, 1.0]  # of the longest time budget
+    if rules.whole_budgets:  # rounded, budgets may lie outside of their bounds, and so does their price
+        shares = (rules.budget(np.array([-1.0, 1.0])) / rules.dt_max).tolist()
     costs = [reward.duration_cost * share for share in shares]
     bonus = reward.completion_bonus
     return low - max(costs) + min(bonus, 0.0), high - min(costs) + max(bonus, 0.0)

@@ -42,6 +42,14 @@ def test_without_tests_the_task_alone_counts() -> None:
     assert bounds.high == pytest.approx(-1.0)  # the shortest budget is half of the longest
 
 
+def test_rounded_time_budgets_are_paid_for_as_they_are() -> None:
+    """From 2.4 to 7.6 steps, the price is that of 2 to 8 steps."""
+    rules = OptionRules(7.6, 2.4, max_options=1, whole_budgets=True)
+    bounds = high_level_bounds(make_reward(rules=rules, duration_cost=2.0), rules, SPARSE, None)
+    assert bounds.low == pytest.approx(-1.0 - 2.0 * 8 / 7.6)
+    assert bounds.high == pytest.approx(-2.0 * 2 / 7.6)
+
+
 def test_smdp_counts_windows() -> None:
     """dt_ref = 5, gamma_step = .9^(1/5): the lowest decision is the longest window, ten steps of -1."""
     bounds = high_level_bounds(make_reward("smdp", duration_cost=0.5), make_rules(), SPARSE, None)
