@@ -256,9 +256,9 @@ class NDBCNet(nn.Module):
         for name, own in self.cell.named_buffers(prefix="cell"):
             given = state_dict.get(prefix + name)
             if given is not None and not (given.shape == own.shape and bool((given.to(own) == own).all())):
-                raise RuntimeError(
-                    f"{prefix}{name} is that of another wiring; build the network with the wiring that the weights "
-                    "belong to (the same sizes, fans, seed, sensory_to and synapses)"
+                raise RuntimeError(  # in torch's words for weights that do not fit, by which loading knows them
+                    f"state_dict does not fit: {prefix}{name} is that of another wiring; build the network with the "
+                    "wiring that the weights belong to (the same sizes, fans, seed, sensory_to and synapses)"
                 )
         chosen, direction = (state_dict.pop(prefix + name, None) for name in (STEP_STATE, STEP_DIRECTION))
         super()._load_from_state_dict(state_dict, prefix, *args)

@@ -90,6 +90,8 @@ def test_the_reachability_estimate_comes_and_goes(duration: str, changes: Any, e
         ({"high": {"critic_norm": "batch"}}, "high.critic_norm"),
         ({"low": {"policy_kwargs": {"n_critics": 3}}, "max_options": 3}, "low.policy_kwargs.n_critics"),
         ({"low": {"policy_kwargs": {"ndbc": None}, "ent_coef": 0.1}}, "low.policy_kwargs.ndbc"),
+        ({"low": {"policy_kwargs": {"ndbc": {"seed": 1}}}}, "low.policy_kwargs.ndbc.seed"),
+        ({"low": {"policy_kwargs": {"ndbc": {"synapses": "lean"}}}}, "low.policy_kwargs.ndbc.synapses"),
     ],
 )
 def test_what_the_weights_do_not_fit_is_refused_by_name(taught: TBCHRL, changes: Any, named: str) -> None:
