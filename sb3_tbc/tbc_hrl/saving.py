@@ -209,13 +209,14 @@ def parted(given: PlainMapping, where: str = "") -> tuple[Plain, Plain]:
 
 def named(changes: PlainMapping) -> str:
     """What was to be changed, for a message: settings that shape networks, else all."""
-    names = list(_leaves(changes))
+    names = list(leaves(changes))
     return ", ".join([name for name in names if set(name.split(".")) & SHAPES] or names)
 
 
-def _leaves(given: PlainMapping, where: str = "") -> Iterator[str]:
+def leaves(given: PlainMapping, where: str = "") -> Iterator[str]:
+    """Dotted names of settings, those of sections within sections, too."""
     for name, value in given.items():
         if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{where}{name}.")
+            yield from leaves(value, f"{where}{name}.")
         else:
             yield where + name

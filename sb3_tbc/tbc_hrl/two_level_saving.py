@@ -14,8 +14,10 @@ from stable_baselines3.common.type_aliases import GymEnv, TensorDict
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import Arrays
+from sb3_tbc.level.actors import NDBCActor
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.both_levels import Replay
+from sb3_tbc.settings import SettingError, plain
 from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.collection import Collector
@@ -24,8 +26,9 @@ from sb3_tbc.tbc_hrl.environment import mismatch_explained
 from sb3_tbc.tbc_hrl.former_settings import LEVEL_NAMES
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import Reachability
-from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
+from sb3_tbc.tbc_hrl.saving import UNFIT, PlainAlgorithm, leaves
 
+INPUT_SCALE = "low.policy_kwargs.ndbc.input_scale"
 SelfTwoLevel = TypeVar("SelfTwoLevel", bound="TwoLevelSaving")
 
 
@@ -122,10 +125,23 @@ class TwoLevelSaving(PlainAlgorithm):
         """Load an agent, see SB3; ``device="auto"`` is the CPU, where both levels act and learn.
 
         :raises ValueError: if the environment given does not fit, naming the layout that does
+        :raises SettingError: see :meth:`.PlainAlgorithm.load`
         """
         device = "cpu" if device == "auto" else device
         with mismatch_explained():
-            return super().load(path, env, device, custom_objects, print_system_info, force_reset, trust, **kwargs)
+            model = super().load(path, env, device, custom_objects, print_system_info, force_reset, trust, **kwargs)
+        if INPUT_SCALE in leaves({name: plain(value) for name, value in kwargs.items()}):
+            model._refuse_other_scale()
+        return model
+
+    def _refuse_other_scale(self) -> None:
+        """Refuse a new scale of the circuit's inputs: it is saved with the weights, which would bring back the old one.
+
+        :raises SettingError: if it is another one
+        """
+        circuit, actor = self.low.policy.level_kwargs["ndbc"], self.low.policy.actor
+        if isinstance(actor, NDBCActor) and not np.allclose(actor.net.input_gain.numpy() * circuit["input_scale"], 1.0):
+            raise SettingError(INPUT_SCALE, UNFIT)
 
     def save(
         self,

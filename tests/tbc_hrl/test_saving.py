@@ -99,6 +99,16 @@ def test_what_the_weights_do_not_fit_is_refused_by_name(taught: TBCHRL, changes:
         TBCHRL.load(saved(taught), env=Corridor(20), **changes)  # type: ignore[arg-type]
 
 
+def test_another_scale_of_inputs_is_refused(taught: TBCHRL) -> None:
+    """The scale is saved with the weights, so that of the settings would never be used."""
+    scale = (1.0 / taught.low.policy.actor.net.input_gain).tolist()  # type: ignore[union-attr]
+    low: Any = {"policy_kwargs": {"net_arch": [8], "ndbc": {"input_scale": scale}}}
+    TBCHRL.load(saved(taught), low=low)  # type: ignore[arg-type]
+    low["policy_kwargs"]["ndbc"]["input_scale"] = [9.0] * len(scale)
+    with pytest.raises(SettingError, match=r"^low\.policy_kwargs\.ndbc\.input_scale cannot be changed when an agent"):
+        TBCHRL.load(saved(taught), low=low)  # type: ignore[arg-type]
+
+
 def test_a_level_may_be_given_as_settings_and_neutral_arguments_of_sb3_pass(taught: TBCHRL) -> None:
     low = LowConfig(batch_size=4, buffer_size=300, policy_kwargs=LEVEL["policy_kwargs"])
     model = TBCHRL.load(saved(taught), env=Corridor(20), low=low, use_sde=False)  # type: ignore[arg-type]
