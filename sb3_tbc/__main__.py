@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from sb3_tbc.commands import COMMANDS, USER_MISTAKE
+from sb3_tbc.commands import COMMANDS, USER_MISTAKE, run_command
 from sb3_tbc.errors import nearest
 
 
@@ -14,15 +14,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; exit status 2 for an unknown one."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help"):
-        print("usage: sb3-tbc <command> [--help]\n")
-        print("\n".join(f"  {name:<10} {command.text}" for name, command in COMMANDS.items()))
-        return 0 if arguments else USER_MISTAKE
+        return run_command(_list_commands, "sb3-tbc", arguments)
     name = arguments[0]
     if name not in COMMANDS:
         print(f"sb3-tbc: error: unknown command {name!r}; {nearest(name, COMMANDS)}", file=sys.stderr)
         return USER_MISTAKE
     status: int = import_module(COMMANDS[name].module).main(arguments[1:])
     return status
+
+
+def _list_commands(arguments: Sequence[str]) -> int:
+    """Print what commands there are; not to name one is a mistake, unless help was asked for."""
+    print("usage: sb3-tbc <command> [--help]\n")
+    print("\n".join(f"  {name:<10} {command.text}" for name, command in COMMANDS.items()))
+    return 0 if arguments else USER_MISTAKE
 
 
 if __name__ == "__main__":
