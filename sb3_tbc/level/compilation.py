@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
+import os
+import shlex
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 
 import torch as th
 from torch import fx
@@ -51,11 +54,34 @@ def compile_step(step: Callable[..., None], example: Sequence[th.Tensor], compil
         except Exception as error:  # whatever a half-installed toolchain brings up
             if compile is True:
                 raise
-            problem = f"compiling failed with {type(error).__name__}: {str(error).strip().splitlines()[:1]}"
+            problem = f"compiling failed with {type(error).__name__}: {_reason(str(error))}"
     if compile is True:
         raise RuntimeError(f"compile=True, but {problem}; install g++ or clang++, or use compile='auto' or False")
     logger.warning("updates run eagerly, several times slower than compiled: %s", problem)
     return step
+
+
+def _reason(message: str) -> str:
+    """The line of a compiler's long message that says what is wrong, else the first one."""
+    lines = message.strip().splitlines()
+    return next((line.strip() for line in lines if "error:" in line or "cannot find" in line), "".join(lines[:1]))
+
+
+@contextmanager
+def libraries_found() -> Iterator[None]:
+    """Let the compiler find torch's libraries in a folder with a space in its name.
+
+    Torch quotes the folders of headers on the compiler's command line, but not that of libraries.
+    """
+    from torch.utils import cpp_extension
+
+    path = cpp_extension.TORCH_LIB_PATH
+    if os.name == "posix":  # elsewhere torch quotes both
+        cpp_extension.TORCH_LIB_PATH = shlex.quote(path)
+    try:
+        yield
+    finally:
+        cpp_extension.TORCH_LIB_PATH = path
 
 
 def _compile(step: Callable[..., None], example: Sequence[th.Tensor]) -> Callable[..., None]:
@@ -69,7 +95,8 @@ def _compile(step: Callable[..., None], example: Sequence[th.Tensor]) -> Callabl
     from torch._inductor import standalone_compile
 
     options = {"config_patches": dict(INDUCTOR)}
-    compiled = standalone_compile(graph, [*copies], dynamic_shapes="from_example_inputs", options=options)
+    with libraries_found():
+        compiled = standalone_compile(graph, [*copies], dynamic_shapes="from_example_inputs", options=options)
     logger.info("compiled an update in %.1f s", time.perf_counter() - start)
     return compiled
 
