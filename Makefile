@@ -30,7 +30,7 @@ help:
 # The stamp is newer than the files that determine what is installed, so nothing is installed twice.
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt
 	@scripts/system-packages.sh
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@scripts/venv.sh '$(VENV)' '$(PYTHON)'
 	$(BIN)/python -m pip install --quiet --editable '.[tests]' --constraint constraints.txt
 	@touch $@
 
