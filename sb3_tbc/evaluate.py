@@ -122,7 +122,10 @@ def command(argv: Sequence[str]) -> int:
     """Evaluate; see ``--help``."""
     args = build_parser().parse_args(argv)
     if args.video is not None:  # checked first, since counting the episodes may take minutes
+        from sb3_tbc.zoo.video import record_video, require_film
+
         require("imageio", extra="video", what="a film")
+        require_film(args.video)
     th.set_num_threads(args.num_threads)
     info = identify(args.model, args.env, args.trust)
     if args.render:
@@ -130,8 +133,6 @@ def command(argv: Sequence[str]) -> int:
     result = evaluate(args.model, info, args.n_episodes, args.seed, args.stochastic, args.device, args.trust)
     _tell(result, args.json)
     if args.video is not None:
-        from sb3_tbc.zoo.video import record_video
-
         env = make_env(info["env_id"], **info["env_kwargs"])
         record_video(
             load_model(args.model, device=args.device, trust=args.trust),

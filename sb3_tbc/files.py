@@ -98,6 +98,8 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     with explained(path):
         path = Path(os.path.realpath(path)) if path.is_symlink() else path
+        if path.is_dir():
+            raise WriteError(f"cannot write {path}: it is a folder; name a file, e.g. one in it")
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = temporary_beside(path)
         try:

@@ -114,12 +114,22 @@ def record_video(model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: 
     :raises ConfigError: if the file's name, the installation or the task do not allow it
     :raises WriteError: if the file cannot be written
     """
-    if path.suffix != ".mp4":
-        raise ConfigError(f"a video's name must end in .mp4, got {path}")
+    require_film(path)
     imageio = require("imageio.v2", extra="video", what="a film")
     fps = frames_per_second(env)
-    writer: _Writer
-    with replacing(path) as temporary, imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
-        for episode in range(n_episodes):
-            for frame in film(model, env, seed + episode):
-                writer.append_data(frame)
+    with replacing(path) as temporary:
+        temporary.touch()  # what the disk refuses is said here in one line, by the encoder in forty
+        writer: _Writer
+        with imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
+            for episode in range(n_episodes):
+                for frame in film(model, env, seed + episode):
+                    writer.append_data(frame)
+
+
+def require_film(path: Path) -> None:
+    """Refuse a name that no film can have.
+
+    :raises ConfigError: unless it ends in ``.mp4``
+    """
+    if path.suffix != ".mp4":
+        raise ConfigError(f"a video's name must end in .mp4, got {path}")

@@ -170,6 +170,15 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
     assert path.read_text() == "old"
 
 
+def test_a_folder_is_no_file_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "pages").mkdir()
+    for path in (Path(), Path(".."), tmp_path / "pages", Path("/")):
+        with pytest.raises(WriteError, match="it is a folder; name a file"):
+            write_atomic(path, "page")
+    assert [p.name for p in tmp_path.rglob("*")] == ["pages"]
+
+
 def test_a_link_stays_one_when_its_file_is_replaced(tmp_path: Path) -> None:
     real, link, missing = tmp_path / "real" / "page.md", tmp_path / "page.md", tmp_path / "missing.md"
     real.parent.mkdir()

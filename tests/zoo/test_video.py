@@ -97,6 +97,17 @@ def test_the_file_is_written_whole(model: TBCHRL, tmp_path: Path) -> None:
         record_video(model, env, path / "b.mp4")
 
 
+def test_a_film_that_cannot_be_written_costs_one_line(model: TBCHRL, tmp_path: Path) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    env = gym.make(ENV_ID, render_mode="rgb_array")
+    (tmp_path / "folder.mp4").mkdir()
+    (tmp_path / "file").touch()
+    for name in ("folder.mp4", "file/a.mp4"):
+        with pytest.raises(WriteError, match=f"cannot write .*{name}: "):
+            record_video(model, env, tmp_path / name, n_episodes=1)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["file", "folder.mp4"]
+
+
 def test_what_cannot_be_drawn_costs_one_line(model: TBCHRL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("imageio_ffmpeg")
     env = gym.make(ENV_ID, render_mode="rgb_array")
