@@ -105,7 +105,7 @@ class CPlayer:
     :param path: the C file
     :param policy: the exported policy, for the sizes
     :param flags: further compiler options
-    :raises ConfigError: if there is no C compiler
+    :raises ConfigError: if there is no C compiler, or if it fails
     """
 
     def __init__(self, path: Path, policy: ExportedPolicy, flags: tuple[str, ...] = ("-O2",)) -> None:
@@ -115,7 +115,9 @@ class CPlayer:
         self._folder = tempfile.TemporaryDirectory()
         library = Path(self._folder.name) / "policy.so"
         command = [compiler, *STRICT, *flags, "-shared", "-fPIC", str(path), "-o", str(library), "-lm"]
-        subprocess.run(command, check=True, capture_output=True, text=True)
+        built = subprocess.run(command, capture_output=True, text=True)
+        if built.returncode != 0:
+            raise ConfigError(f"{compiler} could not compile {path}: {one_line(built.stderr, 1000)}")
         self.library = ctypes.CDLL(str(library))
         self.policy, self.closed_form = policy, False
         self._state = ctypes.create_string_buffer(64 + 8 * (policy.subgoal_dim + policy.state_dim))

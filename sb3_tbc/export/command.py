@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import MLP, Circuit, ExportedPolicy, extract
 from sb3_tbc.extras import require
 from sb3_tbc.files import save_atomic, write_atomic
@@ -77,10 +78,13 @@ def describe(policy: ExportedPolicy) -> str:
 def command(argv: Sequence[str]) -> int:
     """Export; see ``--help``."""
     args = build_parser().parse_args(argv)
+    suffix = SUFFIXES[args.format]
+    if args.output is not None and args.output.suffix != suffix:  # compilers and imports go by it
+        raise ConfigError(f"--format {args.format} writes a file that ends in {suffix}, got --output {args.output}")
     if args.format == "onnx":  # report it before the agent is loaded
         require("onnx", extra="export", what="--format onnx")
     model = load_two_levels(args.model, trust=args.trust)
-    name = args.model.with_suffix(SUFFIXES[args.format])
+    name = args.model.with_suffix(suffix)
     path = args.output or (Path(name.name) if is_pretrained(args.model) else name)  # never into the package
     policy = extract(model, args.model.stem)
     WRITERS[args.format](policy, path)

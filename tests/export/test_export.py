@@ -286,6 +286,14 @@ def test_a_compiler_that_fails_is_told_in_one_line(tmp_path: Path, monkeypatch: 
     assert "not measured (arm-none-eabi-gcc not found; Debian" in cortex_m4_report(tmp_path / "policy.c")
 
 
+def test_a_policy_that_the_machines_compiler_refuses_is_told_in_one_line(
+    pendulum: tuple[TBCHRL, ExportedPolicy], tmp_path: Path
+) -> None:
+    (tmp_path / "policy.c").write_text("int x = ;")
+    with pytest.raises(ConfigError, match=r"could not compile .*policy\.c: .*expected expression"):
+        CPlayer(tmp_path / "policy.c", pendulum[1])
+
+
 def test_a_closed_form_unlike_the_agent_draws_a_warning(tmp_path: Path) -> None:
     model, env = make("memoryless")
     policy = extract(model)
