@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import io
 import os
+import shlex
 import shutil
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError, TrainingError, WriteError
@@ -121,6 +123,12 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
         return INTERRUPTED
 
 
+def python() -> str:
+    """Name this interpreter as the user would type it: short when it lies below the working directory."""
+    path = Path(sys.executable)
+    return shlex.quote(str(path.relative_to(Path.cwd()))) if path.is_relative_to(Path.cwd()) else "python"
+
+
 def stop_like_ctrl_c() -> None:
     """Treat a termination signal like Ctrl-C, so that the run is saved."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -161,3 +169,17 @@ def positive_int(text: str) -> int:
     if not value.is_integer() or value <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
     return int(value)
+
+
+def not_negative(text: str) -> float:
+    """A number of at least zero; ``inf`` is one, ``nan`` is none.
+
+    :raises argparse.ArgumentTypeError: otherwise
+    """
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from error
+    if not value >= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
+    return value

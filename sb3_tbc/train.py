@@ -13,7 +13,17 @@ from typing import Any
 import torch as th
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import INTERRUPTED, Parser, Several, add_trust, positive_int, run_command, seed_number
+from sb3_tbc.commands import (
+    INTERRUPTED,
+    Parser,
+    Several,
+    add_trust,
+    not_negative,
+    positive_int,
+    python,
+    run_command,
+    seed_number,
+)
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.stopping import StopRequest, stop_request
@@ -91,7 +101,8 @@ def build_parser() -> Parser:
     where.add_argument("--trace", action="store_true", help="write every option of training to options.csv, which the "
                        "report draws")  # fmt: skip
     where.add_argument("--tensorboard", action="store_true", help="write TensorBoard files into the run's folder")
-    where.add_argument("--checkpoint-minutes", type=float, default=10.0, help="time between checkpoints for --resume")
+    where.add_argument("--checkpoint-minutes", type=not_negative, default=10.0, help="time between "
+                       "checkpoints for --resume; 0: after every rollout, inf: only where it is stopped")  # fmt: skip
     where.add_argument("--keep-checkpoint", action="store_true", help="keep the last checkpoint of a finished run")
     machine = parser.add_argument_group("machine")
     machine.add_argument("--device", default="cpu", help="torch device; agents of two levels learn on the CPU alone")
@@ -185,15 +196,9 @@ def describe(result: Plain, folder: RunFolder) -> str:
         f"agent          {folder.model}",
         f"best agent     {folder.best_model}" if folder.best_model.is_file() else "best agent     (not evaluated)",
         f"learning curve {folder.evaluations}",
-        f"evaluate       {_python()} -m sb3_tbc.evaluate {shlex.quote(str(folder.model))}",
+        f"evaluate       {python()} -m sb3_tbc.evaluate {shlex.quote(str(folder.model))}",
     ]
     return "\n".join(lines)
-
-
-def _python() -> str:
-    """Return this interpreter as the user would type it: short when it lies below the working directory."""
-    path = Path(sys.executable)
-    return str(path.relative_to(Path.cwd())) if path.is_relative_to(Path.cwd()) else "python"
 
 
 def command(argv: Sequence[str]) -> int:
@@ -224,7 +229,7 @@ def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> 
         folder, result = _run(args, options, argv)
     except Interrupted as stopped:
         where = shlex.quote(str(stopped.folder))
-        print(f"{stopped}; continue with: python -m sb3_tbc.train --resume {where}", file=sys.stderr)
+        print(f"{stopped}; continue with: {python()} -m sb3_tbc.train --resume {where}", file=sys.stderr)
         return INTERRUPTED
     print(describe(result, folder))
     if args.ledger is not None:

@@ -17,7 +17,7 @@ from test_cli import said
 
 from sb3_tbc import __main__, evaluate, train
 from sb3_tbc.benchmark import command as benchmark
-from sb3_tbc.commands import COMMANDS, Parser
+from sb3_tbc.commands import COMMANDS, Parser, python
 from sb3_tbc.export import command as export
 from sb3_tbc.extras import MissingExtraError, require
 from sb3_tbc.ndbc.wiring import NDBCWiring
@@ -268,12 +268,38 @@ def test_evaluations_by_hand_repeat_no_training_episode() -> None:
     assert min(abs(seed - other) for other in taken) > 1_000_000
 
 
-@pytest.mark.parametrize("arguments", [["--n-timesteps", "0"], ["--n-timesteps", "1.5"], ["--nonsense"]])
+BAD = [["--n-timesteps", "0"], ["--n-timesteps", "1.5"], ["--nonsense"]]
+BAD += [["--checkpoint-minutes", minutes] for minutes in ("nan", "-1", "soon")]  # nan never came, so nothing was saved
+
+
+@pytest.mark.parametrize("arguments", BAD)
 def test_bad_arguments(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         train.main(arguments)
     assert stop.value.code == 2
     assert said(capsys).startswith("sb3_tbc.train: error: ")
+
+
+def test_names_of_files_are_refused_before_the_work(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert evaluate.main(["pretrained:Pendulum", "--video", str(tmp_path / "film.gif")]) == 2
+    captured = capsys.readouterr()
+    assert "must end in .mp4" in captured.err
+    assert captured.out == ""
+    export = import_module(COMMANDS["export"].module).main
+    for kind, name, suffix in (("c", "policy", ".c"), ("numpy", "policy", ".py"), ("onnx", "policy.c", ".onnx")):
+        assert export(["pretrained:Pendulum", "--format", kind, "--output", str(tmp_path / name)]) == 2
+        assert f"--format {kind} writes a file that ends in {suffix}, got --output" in said(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_to_type_next_names_this_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "executable", str(tmp_path / ".venv" / "bin" / "python"))
+    assert python() == ".venv/bin/python"  # as make train installs it, where no environment is active
+    monkeypatch.setattr(sys, "executable", str(tmp_path / "my clone" / "python"))
+    assert python() == "'my clone/python'"
+    monkeypatch.setattr(sys, "executable", "/usr/bin/python3")
+    assert python() == "python"
 
 
 def test_an_action_space_that_is_no_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

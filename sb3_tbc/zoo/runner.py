@@ -12,6 +12,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.commands import python
 from sb3_tbc.errors import (
     ConfigError,
     DivergedError,
@@ -388,7 +389,7 @@ class Training:
         if checkpoint is None:
             return "No checkpoint had been written yet"
         how = "Saved" if saved else "The last checkpoint is"
-        resume = f"python -m sb3_tbc.train --resume {shlex.quote(str(self.folder.path))}"
+        resume = f"{python()} -m sb3_tbc.train --resume {shlex.quote(str(self.folder.path))}"
         return f"{how} at step {checkpoint.timesteps}; continue with: {resume}"
 
 
@@ -406,7 +407,7 @@ def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, 
     except (EnvironmentFault, NonFiniteError) as error:
         raise TrainingError(
             f"the evaluation after training failed: {one_line(error, 1000)}. The agent is saved; evaluate it with: "
-            f"python -m sb3_tbc.train --resume {shlex.quote(str(folder.path))}"
+            f"{python()} -m sb3_tbc.train --resume {shlex.quote(str(folder.path))}"
         ) from error
     folder.finish(result)
     if not options.keep_checkpoint:
