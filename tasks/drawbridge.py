@@ -91,8 +91,12 @@ class Drawbridge(GoalTask):
     def _apply_dynamics(self, scales: dict[str, float]) -> None:
         self._thrust, self._bridge_speed = 0.0001 * scales["actuator"], 0.4 * scales["bridge"]
 
+    def _angle_at(self, step: int) -> float:
+        """The bridge's angle [degrees] in a step; 0 is closed."""
+        return -min(max(step - 500, 0) * self._bridge_speed, 90.0)
+
     def _update_bridge(self, step: int) -> None:
-        self._angle = -min(max(step - 500, 0) * self._bridge_speed, 90.0)
+        self._angle = self._angle_at(step)
         self._phase = 2.0 * step / MAX_STEPS - 1.0
 
     def _advance(self, action: list[float]) -> None:
@@ -119,7 +123,8 @@ class Drawbridge(GoalTask):
             "ship_vel": np.array([self._speed]),
             "sails_unfurled": np.array([self._sails]),
             "current_step": np.array([float(self._elapsed)]),
-            "drawbridge_angle_deg": np.array([self._angle]),
+            # Of the present step, as in the recordings; observations keep the angle of the step before.
+            "drawbridge_angle_deg": np.array([self._angle_at(self._elapsed)]),
         }
 
     def _draw(self) -> NDArray[np.uint8]:

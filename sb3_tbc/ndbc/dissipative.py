@@ -125,12 +125,15 @@ class DissipativeCell(nn.Module):
         return arrays.recurrent * share[..., None, None]
 
     @th.no_grad()
-    def certificate(self, dt: float) -> Certificate:
-        """The certificate of equation 21 for sub-steps of length ``dt``, from the exact spectral norms."""
+    def certificate(self, dt: float, input_gain: th.Tensor | float = 1.0) -> Certificate:
+        """The certificate of equation 21 for sub-steps of length ``dt``, from the exact spectral norms.
+
+        :param input_gain: what inputs are multiplied by before they reach the cell, ``(n_inputs, 1)``; W includes it
+        """
         arrays = self.arrays()
         step_terms = self.step_terms(arrays, dt)
         shrink = float(1.0 / (1.0 + dt * arrays.damping.min()))
         recurrent_norm = float(th.linalg.matrix_norm(self.enforced(arrays, step_terms).double(), 2))
-        input_norm = float(th.linalg.matrix_norm(arrays.input_weight.double(), 2))
+        input_norm = float(th.linalg.matrix_norm((input_gain * arrays.input_weight).double(), 2))
         rho = shrink * (1.0 + dt * recurrent_norm)
         return Certificate(rho, shrink * dt * input_norm, shrink * dt * float(self.bias.norm()))

@@ -326,11 +326,13 @@ class NDBCNet(nn.Module):
     def certificate(self) -> Certificate:
         """Bounded-input bounded-state certificate of the dissipative dynamics, per sub-step (equation 21).
 
+        It holds for inputs as :meth:`forward` takes them, before they are divided by ``input_scale``.
+
         :raises ValueError: for conductance dynamics, whose potentials are bounded whatever the weights
         """
         if not isinstance(self.cell, DissipativeCell):
             raise ValueError("conductance dynamics need no certificate: NDBCNet.cell.bounds() holds for any weights")
-        return self.cell.certificate(1.0 / self.sub_steps)
+        return self.cell.certificate(1.0 / self.sub_steps, self.input_gain.unsqueeze(-1))
 
 
 def _after_loading(net: NDBCNet, _: object) -> None:

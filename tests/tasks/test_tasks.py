@@ -292,6 +292,17 @@ def test_drawbridge_reference_times():
     assert episode_length(env, sail_late(253)) > 704
 
 
+def test_drawbridges_state_is_of_one_moment():
+    """Recordings of the original have the angle of the step they name; observations keep that of the step before."""
+    env = make("Drawbridge")
+    env.reset()
+    for _ in range(800):
+        env.step(np.zeros(1))
+        state = env.unwrapped.task_state()
+        step, angle = state["current_step"][0], state["drawbridge_angle_deg"][0]
+        assert angle == -min(max(step - 500, 0) * 0.4, 90.0)
+
+
 def test_platforms_can_be_solved():
     env = make("Platforms", "compact")
     assert [episode_length(env, Roll(), seed=seed) is not None for seed in range(3)] == [True] * 3
