@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from inspect import signature
 
@@ -30,6 +31,7 @@ def make_task(task: str, perturb: PlainMapping | None = None, **kwargs: object) 
     :param perturb: arguments of :class:`sb3_tbc.tasks.perturb.Perturb`; none by default
     :param kwargs: passed to the task's class
     :raises ValueError: for an unknown task or perturbation
+    :raises TypeError: for a ``perturb`` that is no dictionary
     """
     if task not in _CLASSES:
         raise ValueError(f"task must be one of {TASKS}, got {task!r}")
@@ -44,7 +46,9 @@ def make_task(task: str, perturb: PlainMapping | None = None, **kwargs: object) 
         return env
     perturb_class = import_module(f"{__name__}.perturb").Perturb
     allowed = list(signature(perturb_class).parameters)[1:]
-    unknown = sorted(set(perturb) - set(allowed))
+    if not isinstance(perturb, Mapping):
+        raise TypeError(f"perturb must be a dictionary with keys of {allowed}, got {perturb!r}")
+    unknown = sorted(set(perturb) - set(allowed), key=str)
     if unknown:
         raise ValueError(f"perturb has unknown keys {unknown}; allowed are {allowed}")
     perturbed: Env = perturb_class(env, **perturb)

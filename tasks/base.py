@@ -44,7 +44,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     :param observation: ``"paper"`` (sizes of the paper's table 1) or ``"compact"`` (the public benchmark's vector)
     :param legacy_quirks: reproduce the errors of the public implementation, listed in each task's docstring
     :param render_mode: ``None``, ``"rgb_array"`` or ``"human"``
-    :raises ValueError: for an unknown layout or render mode
+    :raises ValueError: for an unknown layout or render mode, or ``legacy_quirks`` that is neither true nor false
     """
 
     metadata: ClassVar[Plain] = {"render_modes": ["rgb_array", "human"], "render_fps": 30}
@@ -85,6 +85,8 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
             raise ValueError(f"observation must be one of {LAYOUTS}, got {observation!r}")
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise ValueError(f"render_mode must be None or one of {self.metadata['render_modes']}, got {render_mode!r}")
+        if legacy_quirks not in (False, True):
+            raise ValueError(f"legacy_quirks must be true or false, got {legacy_quirks!r}")
         self.layout = observation
         self.legacy_quirks = bool(legacy_quirks)
         self.render_mode = render_mode
@@ -172,6 +174,7 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         :param seed: seeds the task's own random generator
         :param options: ``goal`` (desired goal) and ``state`` (dictionary of arrays); what is absent is drawn
         :raises ValueError: for unknown keys, wrong shapes and values that are not finite
+        :raises TypeError: for options, or a state in them, that are no dictionary
         """
         super().reset(seed=seed)
         goal, state = self._read_options(options or {})
@@ -220,12 +223,12 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         :param info: ignored
         :return: a float, or an array ``(...)`` for a batch
         """
-        success = self._holds_batch(*_goal_pair(achieved_goal, desired_goal))
+        success = self._holds_batch(*self._goal_pair(achieved_goal, desired_goal))
         return np.where(success, 0.0, -1.0) if np.ndim(success) else (0.0 if success else -1.0)
 
     def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: object = None) -> Any:
         """Whether the goal test holds: a bool, or an array for a batch. See :meth:`compute_reward`."""
-        success = self._holds_batch(*_goal_pair(achieved_goal, desired_goal)) & self.success_terminates
+        success = self._holds_batch(*self._goal_pair(achieved_goal, desired_goal)) & self.success_terminates
         return success if np.ndim(success) else bool(success)
 
     def compute_truncated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: object = None) -> Any:
@@ -336,6 +339,15 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
     def _holds_batch(self, achieved: Array, desired: Array) -> Any:
         return (np.abs(achieved - desired) <= self._tolerance).all(axis=-1)
 
+    def _goal_pair(self, achieved: ArrayLike, desired: ArrayLike) -> tuple[Array, Array]:
+        pair = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
+        if pair[0].shape != pair[1].shape or pair[0].shape[-1:] != self._goal.shape:
+            raise ValueError(
+                f"achieved and desired goals must have one shape that ends with {self._goal.shape}, got "
+                f"{pair[0].shape} and {pair[1].shape}"
+            )
+        return pair
+
     def _legal(self, action: ArrayLike) -> list[float]:
         """The action as plain floats inside the action space."""
         array = action if isinstance(action, np.ndarray) else np.asarray(action)
@@ -367,21 +379,19 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         return goal, {k: _finite_array(f"options['state'][{k!r}]", v, shapes[k]) for k, v in state.items()}
 
 
-def _goal_pair(achieved: ArrayLike, desired: ArrayLike) -> tuple[Array, Array]:
-    achieved, desired = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
-    if achieved.shape != desired.shape:
-        raise ValueError(f"achieved and desired goals must have one shape, got {achieved.shape} and {desired.shape}")
-    return achieved, desired
-
-
 def _check_keys(what: str, given: PlainMapping, allowed: tuple[str, ...]) -> None:
-    unknown = sorted(set(given) - set(allowed))
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{what} must be a dictionary with keys of {list(allowed)}, got {given!r}")
+    unknown = sorted(set(given) - set(allowed), key=str)
     if unknown:
         raise ValueError(f"{what} has unknown keys {unknown}; allowed are {list(allowed)}")
 
 
 def _finite_array(what: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    array = np.array(value, dtype=np.float64)
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):  # not numbers
+        array = np.array(np.nan)
     if array.shape != shape or not np.all(np.isfinite(array)):
         raise ValueError(f"{what} must be finite numbers of shape {shape}, got {value!r}")
     return array

@@ -35,6 +35,7 @@ class Perturb(Wrapper):
         the state; the low level does not see these entries at all, and subgoals are read from ``achieved_goal``
     :raises ValueError: for values out of range, unknown quantities, goal switches where the goal is fixed, and hidden
         velocities where the task has no such variant
+    :raises TypeError: for a ``dynamics_scale`` that is no dictionary
     """
 
     def __init__(
@@ -53,12 +54,18 @@ class Perturb(Wrapper):
         if not isinstance(action_delay, Integral) or action_delay < 0:
             raise ValueError(f"action_delay must be a whole number of steps, at least 0, got {action_delay!r}")
         self._delay: int = int(action_delay)
+        if not isinstance(dynamics_scale or {}, Mapping):
+            raise TypeError(
+                f"dynamics_scale must map names of {list(env.dynamics_names)} to factors, got {dynamics_scale!r}"
+            )
         self._scales: dict[str, tuple[float, float]] = {
             name: _range(name, scale) for name, scale in (dynamics_scale or {}).items()
         }
         env.check_dynamics(self._scales)
         if self._switch > 0 and env.goal_is_fixed:
             raise ValueError(f"goal_switch must be 0 for {type(env).__name__}: its goal is always the same")
+        if hide_velocities not in (False, True):
+            raise ValueError(f"hide_velocities must be true or false, got {hide_velocities!r}")
         self._hidden: list[int] = []
         if hide_velocities:
             self.subgoals = env.subgoals_without_velocities()

@@ -127,6 +127,13 @@ def test_mistakes_are_explained(task, perturb, word):
         make(task, perturb=perturb)
 
 
+def test_values_of_another_kind_are_explained():
+    with pytest.raises(TypeError, match=r"dynamics_scale must map names of \['mass', .*got 1.2"):
+        make("Pendulum", perturb={"dynamics_scale": 1.2})
+    with pytest.raises(ValueError, match=r"hide_velocities must be true or false, got 'no'"):
+        make("Pendulum", perturb={"hide_velocities": "no"})
+
+
 @pytest.mark.parametrize("layout", ["paper", "compact"])
 @pytest.mark.parametrize("task", ["Pendulum", "UR5Reacher", "UR5ReacherBullet"])
 def test_hidden_velocities_show_nowhere_and_rewards_stay(task, layout):

@@ -280,9 +280,32 @@ def test_user_mistakes_say_what_is_allowed(task):
     env = make(task)
     with pytest.raises(gym.error.ResetNeeded):
         env.step(env.action_space.sample())
-    for options, word in (({"gaol": 1}, "goal"), ({"state": {"speed": 1}}, "speed"), ({"goal": [np.nan]}, "finite")):
+    for options, word in (
+        ({"gaol": 1}, "goal"),
+        ({"state": {"speed": 1}}, "speed"),
+        ({"goal": [np.nan]}, "finite"),
+        ({"goal": "left"}, "finite numbers of shape .*'left'"),
+    ):
         with pytest.raises(ValueError, match=word):
             env.reset(options=options)
+    for options in ([1.0], {"state": 5}):
+        with pytest.raises(TypeError, match="must be a dictionary with keys of"):
+            env.reset(options=options)
+    with pytest.raises(ValueError, match=r"legacy_quirks must be true or false, got 'no'"):
+        make(task, legacy_quirks="no")
+    with pytest.raises(TypeError, match=r"perturb must be a dictionary .*action_delay"):
+        make(task, perturb=5)
+
+
+@all_ids
+def test_goals_of_another_length_are_refused(task):
+    """Some goal tests would compare them all the same: of the first entries, or of a batch as if it were one goal."""
+    env = make(task).unwrapped
+    dim = env.observation_space["desired_goal"].shape[0]
+    for shape in ((), (dim + 1,), (5, dim + 1)):
+        for function in (env.compute_reward, env.compute_terminated, env.compute_truncated):
+            with pytest.raises(ValueError, match=rf"ends with \({dim},\)"):
+                function(np.zeros(shape), np.zeros(shape), {})
 
 
 def test_drawbridge_reference_times():
