@@ -149,11 +149,15 @@ def test_defaults_are_said_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert "default: 3" not in parser.format_help()
 
 
-def test_output_that_nobody_reads_is_one_line() -> None:
+@pytest.mark.parametrize(("name", "command"), [
+    ("sb3_tbc.train", ["sb3_tbc.train", "--help-settings"]), ("sb3-tbc", ["sb3_tbc", "--help"]),
+])  # fmt: skip
+def test_output_that_nobody_reads_is_one_line(name: str, command: list[str]) -> None:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen([sys.executable, "-m", "sb3_tbc.train", "--help-settings"], **pipes) as process:
+    with subprocess.Popen([sys.executable, "-m", *command], **pipes) as process:
         process.stdout.close()  # as head does when it has its lines
-        assert process.stderr.read() == b"sb3_tbc.train: error: broken pipe: what reads the output has ended\n"
+        said = f"{name}: error: broken pipe: what reads the output has ended\n"
+        assert process.stderr.read() == said.encode()
     assert process.returncode == 1
 
 
