@@ -156,8 +156,8 @@ def test_output_that_nobody_reads_is_one_line(name: str, command: list[str]) -> 
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen([sys.executable, "-m", *command], **pipes) as process:
         process.stdout.close()  # as head does when it has its lines
-        said = f"{name}: error: broken pipe: what reads the output has ended\n"
-        assert process.stderr.read() == said.encode()
+        line = f"{name}: error: broken pipe: what reads the output has ended\n"
+        assert process.stderr.read() == line.encode()
     assert process.returncode == 1
 
 
