@@ -55,6 +55,10 @@ def make_task(task: str, perturb: PlainMapping | None = None, **kwargs: object) 
     return perturbed
 
 
+# What gymnasium.make reads of an entry point that is a class, so that render_mode="rgb_array_list" works.
+make_task.metadata = {"render_modes": ["rgb_array", "human"]}  # type: ignore[attr-defined]
+
+
 def register_tasks() -> None:
     """Register every task with Gymnasium; calling it again changes nothing.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from numbers import Integral
 from typing import Any, NamedTuple, SupportsFloat
 
 import numpy as np
@@ -64,12 +65,16 @@ def describe_goal_env(
     :param names: of the coordinates
     :param n_probe_steps: length of the random episodes together
     :param seed: of the random episodes
-    :raises ValueError: if the environment is not a goal environment, does not tell when a goal is reached, or bounds do
-        not fit
+    :raises ValueError: if the environment is not a goal environment, does not tell when a goal is reached, or what is
+        given does not fit
     """
+    if not isinstance(n_probe_steps, Integral) or n_probe_steps < 1:
+        raise ValueError(f"n_probe_steps must be a whole number of at least 1, got {n_probe_steps!r}")
+    given_bounds = _numbers("low", low), _numbers("high", high)
+    thresholds = _numbers("thresholds", thresholds)
     check_goal_env(env)
     probe = run_probe(env, n_probe_steps, seed)
-    low, high = _bounds(env, _extent(probe), low, high)
+    low, high = _bounds(env, _extent(probe), *given_bounds)
     within = _contains(probe.seen["observation"], probe.seen["achieved_goal"])
     local = _whole if within else _with_achieved
     space = partial(
@@ -177,9 +182,18 @@ def _extent(probe: Probe) -> tuple[Floats, Floats]:
     return np.minimum(low, desired.min(axis=0)), np.maximum(high, desired.max(axis=0))
 
 
-def _bounds(
-    env: Env, extent: tuple[Floats, Floats], low: ArrayLike | None, high: ArrayLike | None
-) -> tuple[Floats, Floats]:
+def _numbers(name: str, given: ArrayLike | None) -> Floats | None:
+    """What was given, as an array of its own; None where nothing was.
+
+    :raises ValueError: if it is not made of numbers
+    """
+    try:
+        return None if given is None else np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be a number or a list of numbers, got {given!r}") from error
+
+
+def _bounds(env: Env, extent: tuple[Floats, Floats], low: Floats | None, high: Floats | None) -> tuple[Floats, Floats]:
     """Given bounds; else the extent that was seen and a margin, within the declared Box."""
     assert isinstance(env.observation_space, spaces.Dict)
     box = env.observation_space["achieved_goal"]
@@ -188,8 +202,8 @@ def _bounds(
     span = most - least
     margin = np.maximum(0.1 * span, 1e-3 * (span.max() or 1.0))  # of a coordinate that never changes, in any unit
     bounds = (
-        np.maximum(least - margin, box.low) if low is None else np.array(low, float),
-        np.minimum(most + margin, box.high) if high is None else np.array(high, float),
+        np.maximum(least - margin, box.low) if low is None else low,
+        np.minimum(most + margin, box.high) if high is None else high,
     )
     for name, bound in zip(("low", "high"), bounds, strict=True):
         if bound.shape != box.shape:
@@ -197,9 +211,9 @@ def _bounds(
     return bounds
 
 
-def _given_thresholds(given: ArrayLike, dim: int) -> Tolerances:
+def _given_thresholds(given: Floats, dim: int) -> Tolerances:
     """Given thresholds: one for each coordinate, or one for the Euclidean distance."""
-    limits: list[float] = np.atleast_1d(np.asarray(given, dtype=np.float64)).tolist()
+    limits: list[float] = np.atleast_1d(given).tolist()
     single = [[i] for i in range(dim)]
     return Tolerances(limits, [list(range(dim))] if len(limits) == 1 and dim > 1 else single, [])
 

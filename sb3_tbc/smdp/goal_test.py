@@ -95,6 +95,38 @@ def check_goal_test(venv: VecEnv, infos: list[Plain] | None = None) -> None:
         ) from error
 
 
+class RewardComparison:
+    """Warns, once, where an episode's rewards are not those that ``compute_reward`` gives.
+
+    Hindsight asks ``compute_reward`` for the rewards of other goals, so that an agent would learn from both kinds.
+    """
+
+    def __init__(self) -> None:
+        self._done = False
+
+    def __call__(self, goal_test: GoalTest, achieved: FloatArray, desired: FloatArray, rewards: FloatArray) -> None:
+        """Look at the first episode that has more than one step.
+
+        :param achieved: goals after the steps, ``(n, goal_dim)``
+        :param desired: the task's at these moments
+        :param rewards: of the steps, ``(n,)``; the last may pay for more than the goal, as for a fall
+        """
+        if self._done or len(rewards) < 2:
+            return
+        self._done = True
+        given = np.asarray(rewards[:-1], dtype=np.float64)
+        computed = goal_test.reward(achieved[:-1], desired[:-1])
+        off = ~np.isclose(given, computed, rtol=1e-4, atol=1e-5)
+        if off.any():
+            step = int(off.argmax())
+            warnings.warn(
+                f"step {step + 1} of the first episode gave the reward {given[step]:.6g}, compute_reward gives "
+                f"{computed[step]:.6g}: learning in hindsight mixes the two. If a wrapper changes rewards "
+                "(TransformReward, NormalizeReward), leave it out, or let compute_reward change them alike.",
+                stacklevel=2,
+            )
+
+
 class EpisodeJudge:
     """Says whether episodes ended at their goals.
 

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.smdp.faults import reset_or_name
+from sb3_tbc.smdp.goal_test import RewardComparison
 from sb3_tbc.smdp.guard import OnBadStep
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalStep, HierarchicalVecEnv, Proposal
 from sb3_tbc.smdp.hindsight import (
@@ -190,10 +191,12 @@ class EpisodeStore:
     ) -> None:
         self.replay, self.views, self.rules = replay, views, rules
         self.reward, self.low_reward, self.hindsight, self.rng = reward, low_reward, hindsight, rng
+        self._compare = RewardComparison()
 
     def add(self, episode: Episode, goal_test: GoalTest) -> HighLevelSteps:
         """Store an episode; what the high level learns from it."""
         subgoals = self.views.subgoals
+        self._compare(goal_test, episode.achieved_goal[1:], episode.desired_goal[1:], episode.rewards)
         self.replay.low.extend(low_level_steps(episode, subgoals, self.rules, self.low_reward))
         steps = high_level_steps(
             episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.views.high, self.rng

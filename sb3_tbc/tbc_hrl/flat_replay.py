@@ -13,7 +13,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, Arrays
 from sb3_tbc.smdp.episode_limit import BAD_STEP
-from sb3_tbc.smdp.goal_test import goal_test_of
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+from sb3_tbc.smdp.goal_test import RewardComparison, goal_test_of
 from sb3_tbc.tbc_hrl.environment import attribute_of
 
 ARRAYS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")
@@ -34,6 +35,7 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
     def __init__(self, *args: Any, event_goals: bool = False, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self.event_goals = event_goals
+        self._compare = RewardComparison()
 
     def _sample_goals(self, batch_indices: AnyArray, env_indices: AnyArray) -> AnyArray:
         if not self.event_goals or self.env is None:
@@ -93,7 +95,12 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
 
     def _compute_episode_length(self, env_idx: int) -> None:
         """Note a finished episode, see SB3, which takes one that just fills the buffer for an empty one."""
-        fills = self._current_ep_start[env_idx] == self.pos
+        start = int(self._current_ep_start[env_idx])
+        fills = start == self.pos
+        rows = (start + np.arange((self.pos - start - 1) % self.buffer_size + 1)) % self.buffer_size
+        if self.env is not None:
+            achieved, desired = (self.next_observations[key][rows, env_idx] for key in GOAL_KEYS[1:])
+            self._compare(goal_test_of(self.env), achieved, desired, self.rewards[rows, env_idx])
         super()._compute_episode_length(env_idx)
         if fills:
             self.ep_length[:, env_idx] = self.buffer_size

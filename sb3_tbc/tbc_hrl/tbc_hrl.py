@@ -179,7 +179,10 @@ class TBCHRL(TwoLevelSaving):
         if self.env is not None:
             self._read_environment(self.env)
         if self.subgoals is None:
-            raise ValueError("no subgoal space: pass subgoals=SubgoalSpace(...), or an environment that has .subgoals")
+            raise ValueError(
+                "no subgoal space: pass subgoals=SubgoalSpace(...) or an environment that has .subgoals; for one of "
+                "another package, sb3_tbc.tasks.generic.DescribedGoalEnv(env) measures them"
+            )
         self.config = config = self.config.for_episodes_of(self.episode_length)
         subgoals = self.subgoals
         seeds = np.random.SeedSequence(self.seed).generate_state(7).tolist()

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
 import pytest
 from corridor import Corridor
+from gymnasium.wrappers import TransformReward
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.smdp.goal_spaces import said_success
 from sb3_tbc.smdp.goal_test import check_goal_test, goal_test_of
+from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 
 
@@ -46,6 +49,30 @@ def test_a_list_of_infos_is_tried_where_learning_gives_one() -> None:
         check_goal_test(DummyVecEnv([ReadsInfo]), infos=[{}] * 3)
     with pytest.raises(ConfigError, match="a list of empty ones"):
         FlatSAC("MultiInputPolicy", ReadsInfo())
+
+
+class CrashesAtTheEnd(Corridor):
+    """The last step pays for more than the goal."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, success, truncated, info = super().step(action)
+        return observation, reward - 5.0 * truncated, success, truncated, info
+
+
+@pytest.mark.parametrize("agent", [TBCHRL, FlatSAC])
+def test_rewards_that_hindsight_cannot_recompute_are_told_once(agent: type[TBCHRL] | type[FlatSAC]) -> None:
+    """A wrapper that scales rewards leaves those of hindsight as they are, so that an agent learns from both kinds."""
+    settings: dict[str, Any] = {"seed": 0, "learning_starts": 1000}  # nothing is updated
+    if agent is TBCHRL:
+        settings |= {"max_options": 4, "compile": False}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for plain in (Corridor(20), CrashesAtTheEnd(20)):
+            agent("MultiInputPolicy", plain, **settings).learn(45)
+    scaled = TransformReward(Corridor(20), lambda reward: 10.0 * float(reward))
+    with pytest.warns(UserWarning, match="gave the reward -10, compute_reward gives -1: .*TransformReward") as told:
+        agent("MultiInputPolicy", scaled, **settings).learn(90)
+    assert len([w for w in told if "compute_reward" in str(w.message)]) == 1
 
 
 class InPlace(Corridor):

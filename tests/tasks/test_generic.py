@@ -98,6 +98,28 @@ def test_bounds_come_from_random_episodes_within_the_declared_box():
         describe_goal_env(Point(), low=[2, 2], high=[1, 1])
 
 
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"thresholds": "near"}, "thresholds must be a number or a list of numbers, got 'near'"),
+        ({"low": ["left", 0]}, "low must be a number or a list of numbers"),
+        ({"n_probe_steps": 0}, "n_probe_steps must be a whole number of at least 1, got 0"),
+        ({"n_probe_steps": 2.5}, "n_probe_steps must be a whole number"),
+    ],
+)
+def test_what_is_given_is_checked_first(given, message):
+    with pytest.raises(ValueError, match=message):
+        describe_goal_env(Point(), **given)
+
+
+def test_an_agent_names_what_measures_subgoals():
+    from sb3_tbc import TBCHRL
+
+    with pytest.raises(ValueError, match=r"no subgoal space: .*DescribedGoalEnv\(env\)"):
+        TBCHRL("MultiInputPolicy", Point())
+    assert TBCHRL("MultiInputPolicy", DescribedGoalEnv(Point()), max_options=4, compile=False).subgoals.dim == 2
+
+
 class DenseWithTest(Dense):
     def _is_success(self, achieved_goal, desired_goal):
         return np.linalg.norm(achieved_goal - desired_goal, axis=-1) < 0.3

@@ -7,6 +7,7 @@ import sys
 import types
 from ctypes.util import find_library
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from making import make
@@ -229,3 +230,11 @@ def test_human_mode_shows_each_step(monkeypatch):
     assert env.render() is None
     env.close()
     assert isinstance(Window, type)
+
+
+def test_gymnasium_collects_the_pictures_of_an_episode():
+    env = gym.make("sb3_tbc/Pendulum-v0", render_mode="rgb_array_list")
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step(env.action_space.sample())
+    assert np.shape(env.render()) == (4, 480, 640, 3)
