@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import math
 import os
 import shlex
 import shutil
@@ -169,6 +170,17 @@ def positive_int(text: str) -> int:
     if not value.is_integer() or value <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
     return int(value)
+
+
+def duration(text: str) -> float:
+    """Seconds that a measurement takes: a finite number above zero.
+
+    :raises argparse.ArgumentTypeError: otherwise
+    """
+    value = not_negative(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number above 0")
+    return value
 
 
 def not_negative(text: str) -> float:

@@ -109,8 +109,8 @@ def describe(result: PlainMapping) -> str:
     lines = [
         f"agent            {result['algo']} ({result['variant']}), {result['n_timesteps']:,} training steps on "
         f"{result['task']}",
-        f"success rate     {result['success_rate']:.2f}  ({count} of {result['n_episodes']} episodes; 95 % interval "
-        f"{low:.2f} to {high:.2f})",
+        f"success rate     {result['success_rate']:.2f}  ({count} of {result['n_episodes']} episodes; 95 % Wilson "
+        f"interval {low:.2f} to {high:.2f})",
     ]
     for key, text in FIGURES.items():
         if result[key] is not None:
@@ -129,7 +129,7 @@ def command(argv: Sequence[str]) -> int:
     th.set_num_threads(args.num_threads)
     info = identify(args.model, args.env, args.trust)
     if args.render:
-        _watch(args.model, info, args.n_episodes, args.seed, args.device, args.trust)
+        _watch(args.model, info, args.n_episodes, args.seed, args.stochastic, args.device, args.trust)
     result = evaluate(args.model, info, args.n_episodes, args.seed, args.stochastic, args.device, args.trust)
     _tell(result, args.json)
     if args.video is not None:
@@ -140,6 +140,7 @@ def command(argv: Sequence[str]) -> int:
             args.video,
             args.video_episodes,
             args.seed,
+            not args.stochastic,
         )
         env.close()
         print(f"video            {args.video}", file=sys.stderr)
@@ -158,7 +159,9 @@ def _tell(result: PlainMapping, json_out: str | None) -> None:
         print(describe(result), file=sys.stderr)
 
 
-def _watch(path: Path, info: PlainMapping, n_episodes: int, seed: int, device: str, trust: bool) -> None:
+def _watch(
+    path: Path, info: PlainMapping, n_episodes: int, seed: int, stochastic: bool, device: str, trust: bool
+) -> None:
     """Play episodes in a window; episode ``i`` starts from ``seed + i``.
 
     :raises ConfigError: if the environment cannot be drawn, or there is no display
@@ -170,7 +173,7 @@ def _watch(path: Path, info: PlainMapping, n_episodes: int, seed: int, device: s
     try:
         window = Window(f"{info['task']}, {info['algo']}", env.metadata.get("render_fps", 30))
         for episode in range(n_episodes):
-            for frame in episode_frames(model, env, seed + episode):
+            for frame in episode_frames(model, env, seed + episode, not stochastic):
                 window.show(frame)
         window.close()
     except RuntimeError as error:

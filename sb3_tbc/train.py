@@ -191,7 +191,7 @@ def describe(result: Plain, folder: RunFolder) -> str:
     """What to print at the end: the result, where everything lies, and how to evaluate it."""
     low, high = result["success_ci95"]
     lines = [
-        f"success rate   {result['success_rate']:.2f}  (95 % interval {low:.2f} to {high:.2f}, "
+        f"success rate   {result['success_rate']:.2f}  (95 % Wilson interval {low:.2f} to {high:.2f}, "
         f"{result['n_episodes']} episodes, after {result['n_timesteps']:,} steps in {result['wall_time']:.0f} s)",
         f"agent          {folder.model}",
         f"best agent     {folder.best_model}" if folder.best_model.is_file() else "best agent     (not evaluated)",

@@ -21,6 +21,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.campaign.hours import SPEEDS
+from sb3_tbc.commands import duration
 from sb3_tbc.files import write_atomic
 from sb3_tbc.reading import read_yaml
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
@@ -89,7 +90,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", default=sorted(task_names()), metavar="TASK", help="by default all")
     parser.add_argument("--methods", nargs="+", default=METHODS, choices=METHODS, metavar="METHOD")
-    parser.add_argument("--seconds", type=float, default=15.0, help="of training that count (default: %(default)s)")
+    parser.add_argument("--seconds", type=duration, default=15.0, help="of training that count (default: %(default)s)")
     parser.add_argument("--results", type=Path, default=RESULTS / SPEEDS, help="(default: %(default)s)")
     args = parser.parse_args()
     th.set_num_threads(1)

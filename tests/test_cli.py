@@ -76,7 +76,7 @@ def test_evaluate_prints_a_summary_for_people(run: RunFolder, capsys: pytest.Cap
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "agent            tbc-hrl (custom), 400 training steps on Pendulum"
     assert lines[1].startswith(f"success rate     {run.read_final()['success_rate']:.2f}  (")
-    assert "of 2 episodes; 95 % interval" in lines[1]
+    assert "of 2 episodes; 95 % Wilson interval" in lines[1]
     assert 4 <= len(lines) <= 6
 
 

@@ -113,7 +113,7 @@ def robustness(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
         raise ConfigError(f"agents of different tasks cannot be compared, got {', '.join(given)}")
     tables = [measure(Path(m), arguments.n_episodes, arguments.seed, arguments.trust) for m in arguments.models]
     lines = [f"agent {i}: {table[0].agent}" for i, table in enumerate(tables)]
-    head = "".join(f"{f'success {i}':>11}{f'95 % {i}':>14}{f'rough {i}':>9}" for i in range(len(tables)))
+    head = "".join(f"{f'success {i}':>11}{f'95 % Wilson {i}':>15}{f'rough {i}':>9}" for i in range(len(tables)))
     lines.append(f"{'disturbance':<20}{head}")
     for together in zip(*tables, strict=True):
         cells = "".join(_cells(row) for row in together)
@@ -124,4 +124,4 @@ def robustness(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
 
 def _cells(row: Robustness) -> str:
     low, high = row.interval
-    return f"{row.successes / row.episodes:>11.2f}{f'{low:.2f} to {high:.2f}':>14}{row.roughness:>9.3f}"
+    return f"{row.successes / row.episodes:>11.2f}{f'{low:.2f} to {high:.2f}':>15}{row.roughness:>9.3f}"

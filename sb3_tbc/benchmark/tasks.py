@@ -21,6 +21,7 @@ import numpy as np
 
 from sb3_tbc.aliases import Env
 from sb3_tbc.arrays import AnyArray
+from sb3_tbc.commands import duration
 from sb3_tbc.tasks import TASKS, register_tasks
 
 PUBLIC = {
@@ -127,7 +128,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", nargs="*", default=list(TASKS), metavar="TASK", help=f"of {', '.join(TASKS)}")
-    parser.add_argument("--seconds", type=float, default=2.0, help="per task and layout")
+    parser.add_argument("--seconds", type=duration, default=2.0, help="per task and layout")
     parser.add_argument("--against", metavar="MODULE:FUNCTION", help="makes the environment to compare with")
     arguments = parser.parse_args()
     unknown = sorted(set(arguments.tasks) - set(TASKS))

@@ -125,6 +125,9 @@ def plan(todo: Sequence[Job], workers: int, speeds: Speeds) -> list[str]:
         for job, h in zip(todo, hours, strict=True)
     ]
     known = [h for h in hours if h is not None]
+    if todo and not known:
+        cure = f"no {SPEEDS} and no finished run of these tasks in the folder that --ledger names"
+        return [*lines, f"{len(todo)} runs, hours unknown: {cure}"]
     bare = sum(without_evaluations(job, speeds) for job in todo)
     total = f"{len(todo)} runs, {sum(known):.1f} hours of one core at measured speeds, evaluations included"
     total += f" except those of {bare} runs, whose episodes' length is unknown" if bare else ""

@@ -32,10 +32,10 @@ class _Writer(Protocol):
         """Add a frame."""
 
 
-def film(model: Agent, env: Env, seed: int | None = None) -> Iterator[Frame]:
+def film(model: Agent, env: Env, seed: int | None = None, deterministic: bool = True) -> Iterator[Frame]:
     """The frames of :func:`episode_frames`, the last one held for :data:`OUTCOME_SECONDS`."""
     frame = None
-    for frame in episode_frames(model, env, seed):
+    for frame in episode_frames(model, env, seed, deterministic):
         yield frame
     if frame is not None:
         for _ in range(round(OUTCOME_SECONDS * frames_per_second(env)) - 1):
@@ -47,8 +47,8 @@ def frames_per_second(env: Env) -> float:
     return float(env.metadata.get("render_fps", 30))
 
 
-def episode_frames(model: Agent, env: Env, seed: int | None = None) -> Iterator[Frame]:
-    """Frames of one deterministic episode, one per step and one at the end, each ``(height, width, 3)``.
+def episode_frames(model: Agent, env: Env, seed: int | None = None, deterministic: bool = True) -> Iterator[Frame]:
+    """Frames of one episode, one per step and one at the end, each ``(height, width, 3)``.
 
     The episode ends as in an evaluation: success, time limit, or the high level's action budget used up. Our own tasks
     draw subgoal and remaining time into the scene; pictures of other environments get them in a strip below.
@@ -56,11 +56,12 @@ def episode_frames(model: Agent, env: Env, seed: int | None = None) -> Iterator[
     :param model: a trained agent
     :param env: a task with ``render_mode="rgb_array"``
     :param seed: seed of the reset
+    :param deterministic: act with the means, as evaluations do by default
     """
     observation, _ = env.reset(seed=seed)
     state, start, over, result = None, np.array([True]), False, "time limit"
     while not over:
-        action, carried = model.predict(observation, state, start, deterministic=True)
+        action, carried = model.predict(observation, state, start, deterministic=deterministic)
         shown = Overlay()
         if isinstance(model, TBCHRL) and carried is not None:
             live = TwoLevelState(*carried)
@@ -103,14 +104,17 @@ def _frame(env: Env, shown: Overlay, observation: PlainMapping) -> Frame:
     return frame
 
 
-def record_video(model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: int = 0) -> None:
-    """Record deterministic episodes to an mp4 file, which appears only when it is complete.
+def record_video(
+    model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: int = 0, deterministic: bool = True
+) -> None:
+    """Record episodes to an mp4 file, which appears only when it is complete.
 
     :param model: a trained agent
     :param env: a task with ``render_mode="rgb_array"``
     :param path: the file, ending in ``.mp4``
     :param n_episodes: number of episodes
     :param seed: episode ``i`` starts from ``seed + i``
+    :param deterministic: act with the means, as evaluations do by default
     :raises ConfigError: if the file's name, the installation or the task do not allow it
     :raises WriteError: if the file cannot be written
     """
@@ -122,7 +126,7 @@ def record_video(model: Agent, env: Env, path: Path, n_episodes: int = 3, seed: 
         writer: _Writer
         with imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
             for episode in range(n_episodes):
-                for frame in film(model, env, seed + episode):
+                for frame in film(model, env, seed + episode, deterministic):
                     writer.append_data(frame)
 
 

@@ -60,6 +60,7 @@ def test_the_command_prints_agents_side_by_side(few: None, capsys: Any, tmp_path
     assert benchmark(["robustness", *agents, "--n-episodes", "2", "--json", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "success 1" in printed
+    assert "95 % Wilson 1" in printed
     assert "mass x 1.3" in printed
     rows = json.loads(out.read_text())["rows"]
     assert len(rows) == 2 * (2 + 4)

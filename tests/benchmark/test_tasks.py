@@ -62,3 +62,14 @@ def test_table(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[st
     monkeypatch.setattr(sys, "argv", ["benchmark", "Drawbridge", "--seconds", "0.02", "--against", "other_tasks:make"])
     benchmark.main()
     assert "this run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("seconds", ["nan", "inf", "0", "-1", "long"])
+def test_seconds_are_a_finite_number_above_zero(
+    seconds: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["benchmark", "Drawbridge", "--seconds", seconds])
+    with pytest.raises(SystemExit) as stop:
+        benchmark.main()
+    assert stop.value.code == 2
+    assert f"'{seconds}' is not a" in capsys.readouterr().err.splitlines()[-1]

@@ -44,6 +44,13 @@ def test_the_last_run_ends_when_its_turn_is_over(hours: list[float], workers: in
     assert hours_together(hours, workers) == pytest.approx(whole)
 
 
+def test_a_plan_of_which_nothing_is_known_names_no_hours(tmp_path: Path) -> None:
+    (*_, last) = plan([make_job(tmp_path), make_job(tmp_path, 1)], 2, read_speeds(tmp_path))
+    assert last.startswith("2 runs, hours unknown: no speeds.yml and no finished run of these tasks in")
+    assert "measured" not in last
+    assert plan([], 1, read_speeds(tmp_path))[-1].startswith("0 runs, 0.0 hours")
+
+
 def test_a_plan_waits_for_its_longest_run(tmp_path: Path) -> None:
     speeds = Speeds({}, {}, {}, {("Pendulum", ""): 1000 / 3600})
     plans = plan([make_job(tmp_path), make_job(tmp_path, 1)], 40, speeds)

@@ -117,7 +117,7 @@ def test_every_agent_of_the_package_has_a_card_that_is_true(name: str, capsys: p
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     steps = read_zip(path)["num_timesteps"]
     assert f"{steps:,} environment steps" in card
-    for words in ("Known failings", "licence", "95 % interval", "seed"):
+    for words in ("Known failings", "licence", "95 % Wilson interval", "seed"):
         assert words in card
     assert isinstance(load_pretrained(name), TBCHRL)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from sb3_tbc.tasks.rendering import SUBGOAL
 
-from sb3_tbc import TBCHRL
+from sb3_tbc import TBCHRL, evaluate
 from sb3_tbc.errors import ConfigError, WriteError
 from sb3_tbc.zoo.video import episode_frames, film, record_video
 
@@ -42,6 +42,26 @@ def test_frames_follow_the_live_option(model: TBCHRL, monkeypatch: pytest.Monkey
     changes = [i for i in range(1, len(times)) if times[i] > times[i - 1]]
     assert len(changes) <= 1  # two options: time runs down, jumps once, runs down
     assert seen[-1][2].endswith("action budget used up")
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_films_act_as_the_evaluation_does(
+    model: TBCHRL, deterministic: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """``evaluate --stochastic --video`` filmed the means, whatever was counted."""
+    pytest.importorskip("imageio_ffmpeg")
+    asked, original = set(), TBCHRL.predict
+
+    def predict(*args: Any, **named: Any) -> Any:
+        asked.add(named["deterministic"])
+        return original(*args, **named)
+
+    monkeypatch.setattr(TBCHRL, "predict", predict)
+    path = tmp_path / "agent.zip"
+    model.save(path)
+    given = [str(path), "--env", "Drawbridge", "--n-episodes", "1", "--video", str(tmp_path / "a.mp4")]
+    assert evaluate.main([*given, "--video-episodes", "1", *([] if deterministic else ["--stochastic"])]) == 0
+    assert asked == {deterministic}
 
 
 def test_the_outcome_stays_for_a_second_and_a_half(model: TBCHRL) -> None:
