@@ -111,8 +111,8 @@ def card(task: str, recipe: Recipe, info: dict[str, Any], result: dict[str, Any]
 | environment | `{info["env_id"]}`, arguments `{kwargs}` |
 | algorithm | {info["algo"]}, variant {info["variant"]}, `--config {info["config"]}` of this package's settings |
 | seed, steps | {info["seed"]}; {result["n_timesteps"]:,} environment steps |
-| success | **{result["success_rate"]:.3f}** (95 % Wilson interval {low:.3f} to {high:.3f}; {result["n_episodes"]} episodes \
-that training did not see, deterministic) |
+| success | **{result["success_rate"]:.3f}** (95 % Wilson interval {low:.3f} to {high:.3f}; {result["n_episodes"]} \
+episodes that training did not see, deterministic) |
 | subgoals reached | {_share(result["subgoal_success"])} of windows |
 | mean length of an episode | {result["mean_length"]:.0f} steps |
 | made with | sb3_tbc {sb3_tbc.__version__}, `python scripts/pretrained.py {task}` |

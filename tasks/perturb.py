@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from numbers import Integral
-from typing import SupportsFloat
+from numbers import Integral, Real
+from typing import SupportsFloat, TypeGuard
 
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
@@ -51,7 +51,7 @@ class Perturb(Wrapper):
         self._task: GoalTask = env
         self._noise = _number("observation_noise", observation_noise, 0.0, np.inf)
         self._switch = _number("goal_switch", goal_switch, 0.0, 1.0)
-        if not isinstance(action_delay, Integral) or action_delay < 0:
+        if not isinstance(action_delay, Integral) or isinstance(action_delay, bool) or action_delay < 0:
             raise ValueError(f"action_delay must be a whole number of steps, at least 0, got {action_delay!r}")
         self._delay: int = int(action_delay)
         if not isinstance(dynamics_scale or {}, Mapping):
@@ -120,14 +120,19 @@ class Perturb(Wrapper):
         return observation
 
 
+def _is_real(value: object) -> TypeGuard[float]:
+    """Whether it is a number of Python or NumPy; true and false are none, which YAML makes of yes and no."""
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
 def _number(name: str, value: object, low: float, high: float) -> float:
-    if not isinstance(value, (int, float)) or not low <= value < np.inf or not value <= high:
+    if not _is_real(value) or not low <= value < np.inf or not value <= high:
         raise ValueError(f"{name} must be a number from {low} to {high}, got {value!r}")
     return float(value)
 
 
 def _range(name: str, scale: Scale) -> tuple[float, float]:
-    pair = list(scale) if isinstance(scale, Sequence) and not isinstance(scale, str) else [scale, scale]
-    if len(pair) != 2 or not all(isinstance(v, (int, float)) and 0 < v < np.inf for v in pair) or pair[0] > pair[1]:
+    pair = list(scale) if isinstance(scale, Sequence | np.ndarray) and not isinstance(scale, str) else [scale, scale]
+    if len(pair) != 2 or not all(_is_real(v) and 0 < v < np.inf for v in pair) or pair[0] > pair[1]:
         raise ValueError(f"dynamics_scale[{name!r}] must be a positive factor or a [low, high] range, got {scale!r}")
     return float(pair[0]), float(pair[1])

@@ -175,7 +175,10 @@ class RecurrentSACPolicy(SACPolicy):
         if len(memory) != len(flat_observation):
             raise ValueError(f"state is of {len(memory)} environments, the observation of {len(flat_observation)}")
         if episode_start is not None:
-            fresh = np.broadcast_to(np.asarray(episode_start, dtype=bool), len(memory))[:, None]
+            begun, n = np.asarray(episode_start, dtype=bool), len(memory)
+            if begun.ndim and begun.shape != (n,):  # one of another length would be spread over all environments
+                raise ValueError(f"episode_start has one entry for each of {n} environments, got shape {begun.shape}")
+            fresh = np.broadcast_to(begun, n)[:, None]
             memory, last_action = np.where(fresh, 0.0, memory), np.where(fresh, 0.0, last_action)
         inputs = np.concatenate([flat_observation, last_action], axis=1, dtype=np.float32)
         unit, memory = self._act(inputs, memory.astype(np.float32), deterministic)

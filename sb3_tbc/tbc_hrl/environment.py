@@ -104,6 +104,10 @@ def check_sizes(space: spaces.Dict, batch: Arrays) -> None:
             raise ValueError(
                 f"this agent acts on {key} of shape ({expected},) or (n, {expected}), got {tuple(shape)}.{cure}"
             )
+    counts = {key: np.shape(batch[key])[:-1] for key in GOAL_KEYS}
+    if len(set(counts.values())) > 1:
+        shapes = ", ".join(f"{key} {np.shape(batch[key])}" for key in counts)
+        raise ValueError(f"the parts of an observation must be of the same environments, got {shapes}")
 
 
 @contextlib.contextmanager

@@ -119,7 +119,10 @@ class TBCPolicy(BasePolicy):
         clock, membrane = self._unpacked(n, state)
         starts = np.ones(n, bool) if state is None else np.zeros(n, bool)
         if episode_start is not None:
-            starts |= np.asarray(episode_start, dtype=bool)
+            begun = np.asarray(episode_start, dtype=bool)
+            if begun.ndim and begun.shape != (n,):  # one of another length would be spread over all environments
+                raise ValueError(f"episode_start has one entry for each of {n} environments, got shape {begun.shape}")
+            starts |= begun
         over = self._begin_options(clock, batch, starts, deterministic)
         seen = self.views.low(batch, clock.subgoal, self.rules.remaining(clock.time_left))
         membrane = self.actor.forget(membrane, over, starts)
@@ -135,15 +138,25 @@ class TBCPolicy(BasePolicy):
         clock = OptionClock(n, self.views.subgoals, self.rules)
         if state is None:
             return clock, self.actor.blank(n)
+        if not isinstance(state, tuple | list) or len(state) != len(TwoLevelState._fields):
+            raise ValueError(
+                f"state must be what predict returned ({', '.join(TwoLevelState._fields)}), or None where episodes "
+                f"begin; got {type(state).__name__}"
+            )
         given = TwoLevelState(*state)
         if len(given.elapsed) != n:
             raise ValueError(
                 f"state is of {len(given.elapsed)} environments, the observation of {n}: pass the state that predict "
                 "gave for these environments, or None where episodes begin"
             )
-        for name in OptionClock.carried:
-            getattr(clock, name)[:] = getattr(given, name)
-        return clock, np.array(given.membrane, dtype=np.float32)
+        own = _packed(clock, self.actor.blank(n))
+        for name, mine, part in zip(own._fields, own, given, strict=True):
+            if np.shape(part) != mine.shape:  # NumPy would spread a narrower one over all entries
+                raise ValueError(
+                    f"state.{name} is of shape {mine.shape} here, got {np.shape(part)}: is it of another agent?"
+                )
+            mine[...] = part
+        return clock, own.membrane
 
     def _begin_options(self, clock: OptionClock, batch: Arrays, starts: BoolArray, deterministic: bool) -> BoolArray:
         """Replace the options that are over, in place; which they are."""

@@ -109,6 +109,8 @@ def test_memory_lasts_from_call_to_call_and_ends_with_the_episode() -> None:
     assert_allclose(both, np.stack([actions[0], fresh[1]]), atol=1e-6)
     with pytest.raises(ValueError, match="state is of 2 environments, the observation of 1"):
         model.predict(last, several)
+    with pytest.raises(ValueError, match=r"episode_start has one entry for each of 2 environments, got shape \(1,\)"):
+        model.predict(np.stack([last, last]), several, np.array([True]))
 
 
 @pytest.mark.parametrize("cell", sorted(CELLS))

@@ -119,6 +119,9 @@ def test_goals_switch_consistently():
         ("Pendulum", {"dynamics_scale": {"colour": 1.0}}, "mass"),
         ("Pendulum", {"dynamics_scale": {"mass": [2.0, 1.0]}}, "range"),
         ("Pendulum", {"dynamics_scale": {"mass": 0.0}}, "positive"),
+        ("Pendulum", {"dynamics_scale": {"mass": True}}, "positive"),
+        ("Pendulum", {"observation_noise": True}, "observation_noise"),
+        ("Pendulum", {"action_delay": True}, "whole number"),
         ("Drawbridge", {"goal_switch": 0.1}, "always the same"),
     ],
 )
@@ -132,6 +135,12 @@ def test_values_of_another_kind_are_explained():
         make("Pendulum", perturb={"dynamics_scale": 1.2})
     with pytest.raises(ValueError, match=r"hide_velocities must be true or false, got 'no'"):
         make("Pendulum", perturb={"hide_velocities": "no"})
+
+
+def test_numbers_of_numpy_are_numbers():
+    one = {"observation_noise": np.float32(0.5), "dynamics_scale": {"mass": np.float32(2.0), "gravity": np.ones(2)}}
+    other = {"observation_noise": 0.5, "dynamics_scale": {"mass": 2.0, "gravity": [1.0, 1.0]}}
+    np.testing.assert_array_equal(*(stack(trace(make("Pendulum", perturb=p))) for p in (one, other)))
 
 
 @pytest.mark.parametrize("layout", ["paper", "compact"])

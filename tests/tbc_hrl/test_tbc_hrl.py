@@ -127,6 +127,30 @@ def test_predict_leaves_the_callers_state_alone() -> None:
         np.testing.assert_array_equal(part, copy)
 
 
+def test_predict_refuses_what_numpy_would_spread_over_environments() -> None:
+    """A narrow subgoal or one start for three environments was taken; others ended in NumPy's words."""
+    model = make()
+    space = model.observation_space
+    batch = {key: np.stack([space[key].sample() for _ in range(3)]) for key in space}  # type: ignore[index]
+    _, state = model.predict(batch)
+    assert state is not None
+    for start in (np.array([True]), np.array([True, False]), np.ones((3, 1), bool)):
+        with pytest.raises(ValueError, match=r"episode_start has one entry for each of 3 environments, got shape"):
+            model.predict(batch, state, start)
+    model.predict(batch, state, np.bool_(True))
+    for wrong in (state[:3], np.zeros((3, 4)), "state"):
+        with pytest.raises(ValueError, match="state must be what predict returned"):
+            model.predict(batch, wrong)  # type: ignore[arg-type]
+    for name in ("subgoal", "membrane"):
+        with pytest.raises(ValueError, match=rf"state\.{name} is of shape .* of another agent"):
+            model.predict(batch, state._replace(**{name: getattr(state, name)[:1]}))  # type: ignore[attr-defined]
+    with pytest.raises(ValueError, match=r"state\.used is of shape \(3,\) here, got \(1,\)"):
+        model.predict(batch, state._replace(used=state[3][:1]))  # type: ignore[attr-defined]
+    for key in batch:
+        with pytest.raises(ValueError, match="parts of an observation must be of the same environments"):
+            model.predict({**batch, key: batch[key][:2]})
+
+
 def test_batched_predict_equals_single() -> None:
     model = make()
     seen = [Corridor().reset(seed=s)[0] for s in range(3)]
