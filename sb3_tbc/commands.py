@@ -163,24 +163,10 @@ def positive_int(text: str) -> int:
 
     :raises argparse.ArgumentTypeError: otherwise
     """
-    try:
-        value = float(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from error
+    value = _number(text)
     if not value.is_integer() or value <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
     return int(value)
-
-
-def duration(text: str) -> float:
-    """Seconds that a measurement takes: a finite number above zero.
-
-    :raises argparse.ArgumentTypeError: otherwise
-    """
-    value = not_negative(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number above 0")
-    return value
 
 
 def not_negative(text: str) -> float:
@@ -188,10 +174,25 @@ def not_negative(text: str) -> float:
 
     :raises argparse.ArgumentTypeError: otherwise
     """
-    try:
-        value = float(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from error
+    value = _number(text)
     if not value >= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of at least 0")
     return value
+
+
+def duration(text: str) -> float:
+    """Seconds that a measurement takes: a finite number above zero.
+
+    :raises argparse.ArgumentTypeError: otherwise
+    """
+    value = _number(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a finite number above 0")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number") from error
