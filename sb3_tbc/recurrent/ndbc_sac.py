@@ -24,6 +24,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.ndbc.extractor import input_scale_of
 from sb3_tbc.recurrent.cells import NDBCCell, make_cell
 from sb3_tbc.recurrent.sequences import SequenceReplayBuffer, Sequences, flat, flat_space
+from sb3_tbc.tbc_hrl.environment import episode_starts
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
 State = tuple[AnyArray, ...]
@@ -175,10 +176,7 @@ class RecurrentSACPolicy(SACPolicy):
         if len(memory) != len(flat_observation):
             raise ValueError(f"state is of {len(memory)} environments, the observation of {len(flat_observation)}")
         if episode_start is not None:
-            begun, n = np.asarray(episode_start, dtype=bool), len(memory)
-            if begun.ndim and begun.shape != (n,):  # one of another length would be spread over all environments
-                raise ValueError(f"episode_start has one entry for each of {n} environments, got shape {begun.shape}")
-            fresh = np.broadcast_to(begun, n)[:, None]
+            fresh = episode_starts(episode_start, len(memory))[:, None]
             memory, last_action = np.where(fresh, 0.0, memory), np.where(fresh, 0.0, last_action)
         inputs = np.concatenate([flat_observation, last_action], axis=1, dtype=np.float32)
         unit, memory = self._act(inputs, memory.astype(np.float32), deterministic)

@@ -10,12 +10,13 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import ArrayLike
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.arrays import Arrays
+from sb3_tbc.arrays import Arrays, BoolArray
 from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.episode_limit import with_episode_limit
@@ -87,6 +88,18 @@ def episode_length(env: VecEnv) -> int | None:
         wrapped = attribute_of(env, "_max_episode_steps")  # of the outermost TimeLimit
         limit = min(limit, int(wrapped)) if limit and wrapped else limit or wrapped
     return limit
+
+
+def episode_starts(given: ArrayLike, n_envs: int) -> BoolArray:
+    """Which environments begin an episode, ``(n_envs,)``, as ``predict`` is told.
+
+    :param given: one entry for each environment, or one for all
+    :raises ValueError: for another number of them, which NumPy might spread over all environments
+    """
+    starts = np.asarray(given, dtype=bool)
+    if starts.ndim and starts.shape != (n_envs,):
+        raise ValueError(f"episode_start has one entry for each of {n_envs} environments, got shape {starts.shape}")
+    return np.broadcast_to(starts, n_envs)
 
 
 def check_sizes(space: spaces.Dict, batch: Arrays) -> None:

@@ -22,7 +22,7 @@ from sb3_tbc.smdp.hierarchical_vec_env import Schedule
 from sb3_tbc.smdp.options import OptionClock, OptionRules
 from sb3_tbc.smdp.views import LevelViews
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
-from sb3_tbc.tbc_hrl.environment import check_sizes
+from sb3_tbc.tbc_hrl.environment import check_sizes, episode_starts
 from sb3_tbc.tbc_hrl.reconsideration import Reconsideration
 
 
@@ -119,10 +119,7 @@ class TBCPolicy(BasePolicy):
         clock, membrane = self._unpacked(n, state)
         starts = np.ones(n, bool) if state is None else np.zeros(n, bool)
         if episode_start is not None:
-            begun = np.asarray(episode_start, dtype=bool)
-            if begun.ndim and begun.shape != (n,):  # one of another length would be spread over all environments
-                raise ValueError(f"episode_start has one entry for each of {n} environments, got shape {begun.shape}")
-            starts |= begun
+            starts |= episode_starts(episode_start, n)
         over = self._begin_options(clock, batch, starts, deterministic)
         seen = self.views.low(batch, clock.subgoal, self.rules.remaining(clock.time_left))
         membrane = self.actor.forget(membrane, over, starts)
