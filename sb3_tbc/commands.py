@@ -139,8 +139,8 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     """Add the option that allows a saved agent's file to run code."""
     parser.add_argument(
         "--trust", action="store_true", help="load the agent even if its file can run code on this machine; use it "
-        "only for files whose origin you know. Needed for agents of version 0.1, for policy classes of your own, and "
-        "for environments that are defined in a module of your own",
+        "only for files whose origin you know. Needed for agents saved by development versions of 0.1.0, for policy "
+        "classes and subgoal functions of your own, and for environments that a module of your own defines",
     )  # fmt: skip
 
 

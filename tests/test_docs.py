@@ -32,6 +32,20 @@ def test_links_lead_somewhere(page: Path) -> None:
             assert (page.parent / target).exists(), f"{page.name}: {target}"
 
 
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and MyST name them."""
+    headings = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", pages([*PAGES, *NOTES]))
+def test_links_into_pages_name_a_heading(page: Path) -> None:
+    for path, anchor in re.findall(r"\]\(([^)#\s:]*\.md)?#([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        target = page.parent / path if path else page
+        if target.name not in DERIVED:
+            assert anchor in anchors(target), f"{page.name}: {path}#{anchor}"
+
+
 @pytest.mark.parametrize("page", pages(PAGES))
 def test_modules_and_names_exist(page: Path) -> None:
     for name in set(re.findall(r"\bsb3_tbc(?:\.[A-Za-z_]\w*)+", page.read_text(encoding="utf-8"))):

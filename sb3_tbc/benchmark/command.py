@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 EXAMPLES = {
     "sb3_tbc.benchmark train Pendulum": "training speed beside SB3's SAC, and where the time goes",
     "sb3_tbc.benchmark cells --json cells.json": "the circuit beside LTC, CfC and GRU",
-    "sb3_tbc.benchmark parameters": "sizes of the circuits of table A1",
+    "sb3_tbc.benchmark parameters": "sizes of all circuits and of the MLPs that they replace",
     "sb3_tbc.benchmark fit --tasks Pendulum --actors lean mlp --steps 500 2000": "what actors learn by imitation",
     "sb3_tbc.benchmark robustness pretrained:Pendulum": "a trained agent under noise, late actions and other physics",
 }
@@ -30,11 +30,11 @@ JSON_HELP = "write the figures to this file, too"
 
 def build_parser() -> Parser:
     """The command's arguments, one sub-command per thing to measure."""
-    text = "Measure speed with one torch thread. Machines are noisy: compare figures of one run only."
+    text = "Speed, sizes, imitation and robustness, on one thread. Machines are noisy: compare times of one run only."
     parser = Parser("sb3_tbc.benchmark", EXAMPLES, description=text)
     commands = parser.add_subparsers(dest="subject", required=True, parser_class=Parser)
     _add_cells(commands)
-    parameters = commands.add_parser("parameters", help="parameter counts of table A1's circuits beside their MLPs")
+    parameters = commands.add_parser("parameters", help="sizes of table A1's and the shipped circuits, beside MLPs")
     parameters.add_argument("--json", metavar="OUT", help=JSON_HELP)
     _add_train(commands)
     _add_fit(commands)

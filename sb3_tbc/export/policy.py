@@ -29,6 +29,10 @@ Reads = Callable[[Mapping[str, FloatArray]], FloatArray]
 """A task's function of a (batched) observation: its local state or its point in subgoal space."""
 
 
+RETRAIN = "train it with duration='joint' or 'fixed'"
+TIMED = "load it with window_end='timed' to export it with windows that run to their end"
+
+
 class Coordinate(NamedTuple):
     """One coordinate of a state's subgoal-space point, computed from the concatenated observation and achieved goal.
 
@@ -173,18 +177,18 @@ def extract(model: TBCHRL, task: str = "policy") -> ExportedPolicy:
     """
     views, rules, subgoals = model.views, model.rules, model.views.subgoals
     if isinstance(model.schedule, ReachRule):
-        raise ConfigError("an agent with duration='rule' cannot be exported: its windows come from another network")
+        raise ConfigError(f"duration='rule' cannot be exported: its windows come from another network; {RETRAIN}")
     if rules.may_be_reconsidered:
         raise ConfigError(
             "an agent with window_end='reconsider' cannot be exported: the high level's critic ends its windows, and "
-            "exports hold actors alone; load it with window_end='timed' to export it with windows that run to their end"
+            f"exports hold actors alone; {TIMED}"
         )
     unit_time = None if model.schedule is None else model.schedule.unit
     n_observation, n_achieved, n_desired = (width(cast(spaces.Dict, model.observation_space), key) for key in GOAL_KEYS)
     probe = _Probe(n_observation, n_achieved)
     needed = rules.window_end == "reached" or views.relative_subgoals
     if subgoals.rotations and rules.window_end == "reached":
-        raise ConfigError("window_end='reached' with subgoals that are compared by angle cannot be exported")
+        raise ConfigError(f"window_end='reached' with subgoals that are compared by angle cannot be exported; {TIMED}")
     high: LevelActor | _MLPActor = model.high.policy.average_actor
     low = model.low.policy.average_actor
     if model.foreign_high is not None:

@@ -73,6 +73,9 @@ class SACLevel(SAC):
     :param earlier_steps: steps before each sample through which the actor's memory is unrolled, see :class:`.SACUpdate`
 
     Other parameters are SB3's; ``policy_kwargs`` are :class:`LevelPolicy`'s.
+
+    :raises ConfigError: for spaces or policy options that a level cannot have
+    :raises ValueError: for another device than the CPU, an unknown ``actor_q``, or empty ``bounds``
     """
 
     policy: LevelPolicy

@@ -26,6 +26,9 @@ class LevelPolicy(SACPolicy):
     ``average_actor`` has the actor's structure; its parameters are an exponential moving average of the actor's, kept
     by the update and saved with the policy. The deterministic policy of the average is steadier than the latest one's.
 
+    :param observation_space: flat observations of the level
+    :param action_space: the level's actions, unit coordinates
+    :param lr_schedule: learning rate of actor and critics
     :param negative_critic: see :class:`.LevelCritic`
     :param critic_norm: see :class:`.LevelCritic`
     :param mean_bound: see :class:`.GaussianHead`

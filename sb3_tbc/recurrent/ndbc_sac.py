@@ -98,6 +98,9 @@ class RecurrentCritic(_OnSequences, ContinuousCritic):
 class RecurrentSACPolicy(SACPolicy):
     """Actor and critics of SAC, each with a memory of its own.
 
+    :param observation_space: vectors, or dictionaries of them
+    :param action_space: a Box
+    :param lr_schedule: learning rate of actor and critics
     :param cell: the actor's memory: ``"ndbc"``, ``"gru"``, or ``"ltc"`` and ``"cfc"`` of ncps
     :param hidden_size: width of what is read from a memory
     :param cell_kwargs: settings of the actor's cell; of the circuit those of
@@ -227,6 +230,7 @@ class NDBCSAC(PlainAlgorithm, SAC):
     :param env: environment with observations that are vectors, or dictionaries of them
     :param learning_rate: of actor, critics and temperature
     :param batch_size: sequences of each update
+    :param replay_buffer_class: :class:`.SequenceReplayBuffer`, or a class of your own that is derived from it
     :param replay_buffer_kwargs: see :class:`.SequenceReplayBuffer`
     :param policy_kwargs: see :class:`RecurrentSACPolicy`
     :param kwargs: other parameters of SB3's SAC
@@ -325,12 +329,17 @@ class NDBCSAC(PlainAlgorithm, SAC):
         return [*super()._excluded_save_params(), "_state"]
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
-        """Write the replay buffer to one file of plain arrays."""
+        """Write the replay buffer to one file of plain arrays.
+
+        :param path: where to, or an open file
+        """
         self._sequences().save(path)
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """Read what :meth:`save_replay_buffer` wrote; nothing is unpickled.
 
+        :param path: where from, or an open file
+        :param truncate_last_traj: SB3's; it has no effect here
         :raises ValueError: if it does not fit this agent's
         """
         self._sequences().load(path)

@@ -71,6 +71,9 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     Sequences run across the ends of episodes; the memory is blank again where one begins.
 
+    :param buffer_size: environment steps to keep, those of all environments together
+    :param observation_space: vectors, or dictionaries of them, which are joined
+    :param action_space: a Box
     :param sequence_length: steps of a sequence
     :param burn_in: first steps of a sequence that warm its memory up and are not learnt from, unless an episode has
         begun in between

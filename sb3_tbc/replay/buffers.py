@@ -36,8 +36,13 @@ class ReachPairs(NamedTuple):
 
 
 class OptionReplayBuffer(RingBuffer):
-    """The high level's SMDP transitions; ``discounts`` carries ``gamma ** duration`` (SB3 reads it per sample).
+    """The high level's SMDP transitions; ``discounts`` carries each one's own discount, which SB3 reads per sample.
 
+    :param buffer_size: transitions to keep; the oldest are overwritten
+    :param observation_space: flat observations of the high level
+    :param action_space: its unit actions: the subgoal, and the time budget where the level chooses it
+    :param device: of the samples
+    :param seed: seed of the sampling
     :param context: also keep what a teacher of time budgets needs of each option's first state
     :param teacher: gives the labels of :meth:`sample_labelled`; it reads what ``context`` keeps
     """
@@ -104,8 +109,16 @@ class SubgoalReplayBuffer(RingBuffer):
     ``"episode"`` (HAC, which has no time): the point reached at a strictly later step of the window, or at any of
     its steps; where fewer than n are there to draw from, the share falls accordingly.
 
+    :param buffer_size: environment steps to keep; the oldest are overwritten
+    :param observation_space: flat observations of the low level
+    :param action_space: its unit actions
+    :param views: what the low level sees, and the subgoal space
+    :param rules: what ends a window
+    :param state_dim: membrane potentials kept with each step; 0 for an actor without memory
     :param gamma: discount per environment step
     :param n_hindsight_goals: n above, relabelled samples per plain one
+    :param device: of the samples
+    :param seed: seed of the sampling
     :param reward: the low level's reward, by default the sparse one
     :param hindsight: ``"timed"``, ``"future"`` or ``"episode"``
     :param sequence_length: with more than 1, samples hold up to ``sequence_length - 1`` earlier steps of their window,
@@ -176,6 +189,8 @@ class SubgoalReplayBuffer(RingBuffer):
         The label is the step at which that point was first reached, within the subgoal's thresholds: if a path returns
         to a point, the later visits do not tell how far away it is.
 
+        :param n: number of pairs
+        :param horizon: environment steps
         :param rng: random numbers of this draw alone, so that it does not change how transitions are sampled
         """
         data = self.data

@@ -23,6 +23,10 @@ class RingBuffer(BaseBuffer):
     as from any replay buffer; :meth:`sample_burst` is the fast way.
 
     :param buffer_size: rows to keep; the oldest are overwritten
+    :param observation_space: flat observations of the level
+    :param action_space: its unit actions
+    :param widths: entries of each quantity of a row, by name
+    :param device: of the samples
     :param seed: seed of the sampling
     """
 

@@ -23,6 +23,7 @@ from sb3_tbc.smdp.spaces import SubgoalSpace
 def check_goal_strategy(strategy: str, subgoals: SubgoalSpace | None) -> None:
     """Check that hindsight goals can be chosen this way.
 
+    :param strategy: ``"future"``, ``"episode"`` or ``"event"``, see :func:`goal_pairs`
     :param subgoals: the task's
     :raises ValueError: if they are to come from an event and the task names none
     """
@@ -43,13 +44,13 @@ class GoalTest(NamedTuple):
 class LowLevelSteps(NamedTuple):
     """The low level's transitions of one episode, one row per environment step."""
 
-    local: FloatArray
+    local: FloatArray  # (T, local_dim) what the low level sees of the task
     next_local: FloatArray
-    actions: FloatArray
-    states: FloatArray
+    actions: FloatArray  # (T, action_dim) unit coordinates
+    states: FloatArray  # (T, state_dim) membrane potentials before the step
     next_states: FloatArray
-    subgoal: FloatArray  # what was asked for, task units
-    here: FloatArray  # subgoal-space point before the step
+    subgoal: FloatArray  # (T, subgoal_dim) what was asked for, task units
+    here: FloatArray  # (T, subgoal_dim) subgoal-space point before the step
     achieved: FloatArray  # and after it
     time_left: FloatArray  # (T,) steps of the budget left before the step
     position: NDArray[np.int64]  # (T,) steps since the window began
@@ -65,6 +66,9 @@ def low_level_steps(
 
     A window that the end of the episode cuts off is not over for the low level: its last step bootstraps.
 
+    :param episode: a finished one, of T steps
+    :param subgoals: the task's
+    :param rules: what ended its options
     :param reward: by default 1 where the window ends with its subgoal reached, else 0
     """
     reward = reward or LowLevelReward("sparse", subgoals, rules)
@@ -96,7 +100,7 @@ def low_level_steps(
 
 
 def ordered_pairs(length: NDArray[np.int64], rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """A uniformly drawn pair ``0 <= first <= second < length`` for each window length."""
+    """A uniformly drawn pair ``0 <= first <= second < length`` for each window length, ``(n,)`` each."""
     first = rng.integers(0, length)
     second = rng.integers(0, length + 1)
     # the half of the (length x length + 1) rectangle above the diagonal folds onto the half below it
@@ -107,16 +111,16 @@ def ordered_pairs(length: NDArray[np.int64], rng: np.random.Generator) -> tuple[
 class HighLevelSteps(NamedTuple):
     """The high level's SMDP transitions of one episode, hindsight copies included, one row each."""
 
-    observations: FloatArray
-    actions: FloatArray  # unit coordinates
-    rewards: FloatArray
+    observations: FloatArray  # (n, observation_dim) flat, when the option began
+    actions: FloatArray  # (n, subgoal_dim + 1) subgoal and time budget, unit coordinates
+    rewards: FloatArray  # (n,)
     next_observations: FloatArray
-    dones: NDArray[np.bool_]
-    discounts: FloatArray
-    relabelled: NDArray[np.bool_]  # whether the action is a hindsight one
-    durations: NDArray[np.int64]
-    local: FloatArray  # what the low level saw when the option began
-    here: FloatArray  # and the subgoal-space point where it began
+    dones: NDArray[np.bool_]  # (n,) no bootstrap
+    discounts: FloatArray  # (n,) of the value after the option
+    relabelled: NDArray[np.bool_]  # (n,) whether the action is a hindsight one
+    durations: NDArray[np.int64]  # (n,) environment steps
+    local: FloatArray  # (n, local_dim) what the low level saw when the option began
+    here: FloatArray  # (n, subgoal_dim) and the subgoal-space point where it began
 
 
 class HindsightSettings(NamedTuple):
@@ -142,6 +146,10 @@ def relabel_actions(
     An achieved option keeps its action; another becomes (point reached, time it took), with the time drawn so that
     the budget would have expired at just that step.
 
+    :param episode: a finished one
+    :param subgoals: the task's
+    :param rules: what ended its options, and the range of time budgets
+    :param rng: draws the time budgets
     :param tolerance: the success test of hindsight (paper section 4.5). A point outside of the subgoals' bounds is
         replaced by the nearest subgoal. If it lies further from that than ``tolerance`` (unit coordinates), the
         hindsight option would have failed as well, so the option keeps its action. None: every point is replaced
@@ -168,6 +176,7 @@ def hindsight_success(reached: FloatArray, subgoal: FloatArray, tolerance: float
 
     :param reached: where the options ended, unit coordinates ``(n, subgoal_dim)``
     :param subgoal: their hindsight subgoals, unit coordinates
+    :param tolerance: largest distance of a success, unit coordinates
     """
     return np.asarray(np.linalg.norm(reached - subgoal, axis=-1) <= tolerance)
 
@@ -198,6 +207,10 @@ def goal_pairs(
     ``"episode"`` from all of them; ``"event"`` gives every option one goal, the outcome of the option that the task's
     event ended, and none in an episode without it (as HiTS in Tennis2D, whose goals hold at the second bounce alone).
 
+    :param n_options: options of the episode
+    :param n_goals: goals for each option, as far as there are as many to choose from
+    :param strategy: one of the above
+    :param rng: draws the goals
     :param event: the option that the event ended, None if there was none
     """
     options = np.arange(n_options)
@@ -228,7 +241,14 @@ def high_level_steps(
 
     A test that the task's success cut off has not failed: its subgoal was not needed any more.
 
+    :param episode: a finished one
+    :param subgoals: the task's
+    :param rules: what ended its options
+    :param reward: the high level's
+    :param settings: how much hindsight there is
+    :param goal_test: the task's rewards and ends under other goals
     :param high_view: maps goal observations to the high level's flat observation
+    :param rng: draws goals and time budgets
     """
     actions, changed = relabel_actions(episode, subgoals, rules, rng, settings.tolerance)
     options = _Options(episode, subgoals, actions, changed)
@@ -360,8 +380,14 @@ def relabel_goals(
     goal_test: GoalTest,
     at_end: bool,
 ) -> RelabelledGoals:
-    """Rewards of windows had their goals been ``goals`` (n, goal_dim).
+    """Rewards of n windows had their goals been others.
 
+    :param episode: the one they belong to
+    :param starts: first step of each window, ``(n,)``
+    :param durations: steps of each window, ``(n,)``
+    :param goals: ``(n, goal_dim)``, task units
+    :param reward: the high level's
+    :param goal_test: the task's rewards and ends under other goals
     :param at_end: look at the last step only, as HiTS does; else a window ends at the first step that meets the new
         goal, as the episode would have. Where motion is erratic a goal is passed by chance, and the hindsight action,
         the point where the window ended, would seldom pass it again

@@ -70,7 +70,7 @@ class SubgoalSpace:
 
     :param low: lower bounds of a subgoal, in task units, shape ``(subgoal_dim,)``
     :param high: upper bounds, same shape
-    :param thresholds: largest distance that counts as reached, one per entry of ``groups``, in task units
+    :param thresholds: a subgoal is reached at a distance below these, one per entry of ``groups``, in task units
     :param achieved: maps a goal observation to the subgoal-space point it lies at, ``(..., subgoal_dim)``
     :param local: maps a goal observation to what the low level sees of it, ``(..., local_dim)``
     :param local_scale: fixed task scales that bring ``local`` to about [-1, 1], shape ``(local_dim,)``

@@ -108,8 +108,11 @@ class TBCPolicy(BasePolicy):
         membrane potentials. ``state=None`` begins a new episode. The action budget is counted in ``state.used`` but
         not enforced: a deployed agent goes on.
 
+        :param observation: of one environment, ``{key: (dim,)}``, or of n, ``{key: (n, dim)}``, in the task's units
+        :param state: what the last call returned, see :class:`TwoLevelState`
+        :param episode_start: which environments begin an episode, ``(n,)``; by default all where ``state`` is None
         :param deterministic: use the means of both levels, and the averaged actors where they are kept
-        :return: actions in the environment's units, and the new state
+        :return: actions in the environment's units, ``(action_dim,)`` or ``(n, action_dim)``, and the new state
         :raises ValueError: if the observation is not that of a goal environment, or the state of other environments
         :raises NonFiniteError: if a level answers with NaN
         """

@@ -134,9 +134,11 @@ class PlainAlgorithm(BaseAlgorithm):
 
         Settings given here replace those that it was saved with. A temperature with another ``ent_coef`` begins anew.
 
-        :param trust: also unpickle what has no plain form, as SB3 always does: agents of versions up to 0.1, policy
-            classes and subgoal functions of your own. Use it only for files whose origin you trust: unpickling can run
-            any code.
+        :param path: the agent's ``.zip``, or an open file
+        :param env: an environment to learn in; to act the agent needs none
+        :param trust: also unpickle what has no plain form, as SB3 always does: agents saved by development versions of
+            0.1.0, policy classes and subgoal functions of your own. Use it only for files whose origin you trust:
+            unpickling can run any code.
         :raises UntrustedError: if the file holds something that must be unpickled, unless ``trust`` is given
         :raises ConfigError: if the file is damaged or no agent
         :raises SettingError: on an unknown setting, a value that it cannot have, or one that the weights do not fit

@@ -278,7 +278,7 @@ class TBCHRL(TwoLevelSaving):
 
         :param tb_log_name: name of the run for TensorBoard; none: that of the class
 
-        Other parameters are SB3's.
+        Other parameters are those of :meth:`stable_baselines3.common.base_class.BaseAlgorithm.learn`.
 
         :raises ValueError: without an environment, or if ``total_timesteps`` is negative
         :raises TypeError: if ``total_timesteps`` is not a whole number

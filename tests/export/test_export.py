@@ -334,7 +334,7 @@ def test_an_unknown_subgoal_formula_is_refused() -> None:
 
 def test_an_agent_with_windows_from_another_network_is_refused() -> None:
     model = TBCHRL("MultiInputPolicy", gym.make("sb3_tbc/Pendulum-v0"), seed=0, compile=False, duration="rule")
-    with pytest.raises(ConfigError, match="duration='rule'"):
+    with pytest.raises(ConfigError, match=r"duration='rule'.*train it with duration='joint'"):
         extract(model)
 
 
