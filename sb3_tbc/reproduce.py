@@ -167,24 +167,41 @@ def _slurm_settings(items: Sequence[str]) -> dict[str, object]:
     return {name: parse_yaml(value, f"--slurm {name}") for name, _, value in pairs}
 
 
-def _done(job: Job) -> bool:
-    """Whether the ledger has the run's result.
+def look_up(planned: Sequence[Job]) -> tuple[list[Job], dict[Job, str]]:
+    """Runs without a result in the ledger, and those whose result there is another run's or damaged, with what is said.
 
-    :raises ConfigError: if what it has there is another run's
+    :raises ConfigError: for a run that cannot be made
     """
-    if job.target.finished:
-        job.require_kept(wanted_run(job))
-    return job.target.finished
+    todo: list[Job] = []
+    others: dict[Job, str] = {}
+    for job in planned:
+        if not job.target.finished:
+            todo.append(job)
+            continue
+        wanted = wanted_run(job)
+        try:
+            job.require_kept(wanted)
+        except ConfigError as error:
+            others[job] = str(error)
+    return todo, others
 
 
 def command(argv: Sequence[str]) -> int:
     """Reproduce; see ``--help``."""
     args = build_parser().parse_args(argv)
     planned = list(jobs(argv))
-    todo = [job for job in planned if not _done(job)]
-    print(f"{len(planned)} runs, {len(planned) - len(todo)} of them in {args.ledger}, {len(todo)} to do", flush=True)
+    todo, others = look_up(planned)
+    if others and not args.dry_run:
+        rest = f" ({len(others) - 1} more of this kind; --dry-run lists them)" if len(others) > 1 else ""
+        raise ConfigError(next(iter(others.values())) + rest)
+    there = f", {len(others)} there are not the runs asked for" if others else ""
+    done = len(planned) - len(todo) - len(others)
+    print(f"{len(planned)} runs, {done} of them in {args.ledger}{there}, {len(todo)} to do", flush=True)
     if args.dry_run:
+        print("\n".join(f"refused {job.name}   {said}" for job, said in others.items()), end="\n" if others else "")
         print("\n".join(plan(todo, args.workers, read_speeds(args.ledger))))
+        if others:
+            print(f"without --dry-run nothing begins before the {len(others)} refused runs are dealt with")
         return 0
     if not todo:
         return 0

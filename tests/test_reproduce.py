@@ -84,13 +84,23 @@ def keep_result(job: Job) -> None:
 def test_a_run_of_the_ledger_with_other_settings_is_not_done(
     asked: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    first = next(iter(reproduce.jobs(campaign(tmp_path))))
+    first, second, *_ = reproduce.jobs(campaign(tmp_path))
     keep_result(first)
-    for more in (["--dry-run"], []):
-        assert reproduce.main(campaign(tmp_path, *asked, *more)) == 2
-        said = capsys.readouterr()
-        assert f"{first.target.path} holds another run: {told}; ask for that run with the same options" in said.err
-        assert said.out == ""
+    keep_result(second)
+    assert reproduce.main(campaign(tmp_path, *asked)) == 2
+    said = capsys.readouterr()
+    other = f"{first.target.path} holds another run: {told}; ask for that run with the same options"
+    assert other in said.err
+    assert "(1 more of this kind; --dry-run lists them)" in said.err
+    assert said.out == ""
+    assert reproduce.main(campaign(tmp_path, *asked, "--dry-run")) == 0  # lists all, plans the rest
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].endswith("results, 2 there are not the runs asked for, 2 to do")
+    named = [f"refused Pendulum {job.algo} {job.variant} seed 0   " for job in (first, second)]
+    named += [f"to do   Pendulum {job.algo} {job.variant} seed 1   " for job in (first, second)]
+    assert all(line.startswith(name) for line, name in zip(lines[1:5], named, strict=True))
+    assert other in lines[1]
+    assert lines[-1] == "without --dry-run nothing begins before the 2 refused runs are dealt with"
     assert not (tmp_path / "runs").exists()
 
 
@@ -98,8 +108,13 @@ def test_half_a_result_in_the_ledger_is_not_done(tmp_path: Path, capsys: pytest.
     first = next(iter(reproduce.jobs(campaign(tmp_path))))
     keep_result(first)
     (first.target.path / "final.json").write_text('{"success')
-    assert reproduce.main(campaign(tmp_path, "--dry-run")) == 2
+    assert reproduce.main(campaign(tmp_path)) == 2
     assert "final.json: it is no JSON" in capsys.readouterr().err
+    assert reproduce.main(campaign(tmp_path, "--dry-run")) == 0
+    said = capsys.readouterr().out
+    assert "refused Pendulum hits full seed 0" in said
+    assert "final.json: it is no JSON" in said
+    assert "3 runs, hours unknown" in said
 
 
 def test_an_interrupted_run_is_resumed(tmp_path: Path) -> None:

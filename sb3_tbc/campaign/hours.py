@@ -56,7 +56,7 @@ def _of_finished_runs(ledger: Path) -> tuple[Rows, Rows]:
     lengths: dict[tuple[str, str], list[float]] = defaultdict(list)
     speeds: dict[tuple[str, str], list[float]] = defaultdict(list)
     for folder in finished_runs(ledger):
-        final: Plain = folder.read_final()
+        final = _result(folder)
         speed, length = final.get("steps_per_second"), _mean_length(folder)
         for key in ((str(final.get("task")), str(final.get("algo"))), (str(final.get("task")), "")):
             if isinstance(speed, int | float) and speed > 0:
@@ -64,6 +64,14 @@ def _of_finished_runs(ledger: Path) -> tuple[Rows, Rows]:
             if length is not None:
                 lengths[key].append(length)
     return {key: fmean(found) for key, found in lengths.items()}, {key: median(found) for key, found in speeds.items()}
+
+
+def _result(folder: RunFolder) -> Plain:
+    """A run's result; one that cannot be read, which a report refuses, tells nothing."""
+    try:
+        return folder.read_final()
+    except ConfigError:
+        return {}
 
 
 def _mean_length(folder: RunFolder) -> float | None:
