@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import number, one_line
+from sb3_tbc.zoo.ledger import EVALUATIONS
 
 SHARES = ("success_rate", "best_success_rate", "stable_share", "worst_after_first_90", "subgoal_success")
 NUMBERS = ("mean_length", "mean_length_success", "mean_window", "wall_time", "steps_per_second")
@@ -51,6 +52,16 @@ def check_place(folder: Path, final: PlainMapping) -> None:
                 f"its final.json is of {name} {one_line(repr(said), 100)}, but its folder of {place!r}; "
                 "rename the folder, or move it out of the ledger if it is a copy"
             )
+
+
+def check_steps(steps: Sequence[int]) -> None:
+    """Refuse a learning curve whose steps do not rise: between its points it would be interpolated wrongly.
+
+    :raises ConfigError: naming the first step that is wrong
+    """
+    for before, step in zip((0, *steps), steps, strict=False):
+        if step <= before:
+            raise ConfigError(f"{EVALUATIONS} must have steps above 0 that rise, got {step} after {before}")
 
 
 def check_sections(data: PlainMapping, *names: str) -> None:

@@ -99,11 +99,13 @@ def difference_of(first: Sequence[Run], second: Sequence[Run]) -> stats.Interval
 
 
 def mean_curve(runs: Sequence[Run]) -> tuple[list[int], list[float]] | None:
-    """Mean success over seeds at all evaluated steps; ``None`` without curves."""
+    """Mean success over seeds at all evaluated steps; ``None`` without curves, or if they have no steps in common."""
     curves = [run.curve for run in runs if run.rows]
     if not curves:
         return None
     steps, values = on_union_of_steps(curves)
+    if not len(steps):  # a seed ends before another one is evaluated for the first time
+        return None
     return steps.astype(int).tolist(), values.mean(axis=0).tolist()
 
 

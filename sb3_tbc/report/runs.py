@@ -16,7 +16,7 @@ from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json, read_text, read_yaml
-from sb3_tbc.report.checked import check_final, check_place, check_sections
+from sb3_tbc.report.checked import check_final, check_place, check_sections, check_steps
 from sb3_tbc.zoo.callbacks import EvaluationRow
 from sb3_tbc.zoo.config import OF_PAPER, merge
 from sb3_tbc.zoo.ledger import COMMAND, RESUMED, VERSIONS, RunFolder, finished_runs, run_folders
@@ -177,7 +177,9 @@ def _load(folder: RunFolder) -> Run:
     check_sections(versions, "packages")
     for part in versions.get(RESUMED, []):
         check_sections({RESUMED: part}, RESUMED)
-    return Run(final, folder.read_evaluations(), config, command, versions, folder.path)
+    rows = folder.read_evaluations()
+    check_steps([row.timesteps for row in rows])
+    return Run(final, rows, config, command, versions, folder.path)
 
 
 def _text(path: Path) -> str:

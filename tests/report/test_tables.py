@@ -23,9 +23,11 @@ from sb3_tbc.report.comparisons import (
     convergence_gain,
     difference_of,
     interval_of,
+    mean_curve,
     strongest_baselines,
 )
 from sb3_tbc.report.conditions import notes_of_row
+from sb3_tbc.report.page import to_html
 from sb3_tbc.report.paper import load_paper
 from sb3_tbc.report.runs import (
     BEGIN_ALIKE,
@@ -36,6 +38,7 @@ from sb3_tbc.report.runs import (
     load_results,
     on_union_of_steps,
 )
+from sb3_tbc.report.sections import load_report
 
 ROOT = Path(__file__).parents[2]
 
@@ -191,6 +194,30 @@ def test_a_threshold_is_not_reached_in_the_steps_of_the_shortest_seed(tmp_path: 
     fake_run(tmp_path, "A", "hits", 1, 0.0, curve=[0.0, 0.0, 0.0, 0.0])
     (row,) = against_baselines(load_results(tmp_path))
     assert str(row.gain) == "not reached in 2,000"
+
+
+HEAD = "timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,wall_time\n"
+
+
+@pytest.mark.parametrize(("uneven", "other"), [("tbc-hrl", "hits"), ("hits", "tbc-hrl")])
+def test_seeds_without_a_common_step_have_no_mean_curve(uneven: str, other: str, tmp_path: Path) -> None:
+    for seed, steps in enumerate((1000, 5000)):  # one ends before the other is evaluated for the first time
+        folder = fake_run(tmp_path, "A", uneven, seed, 1.0, config={"eval_freq": steps})
+        folder.evaluations.write_text(f"{HEAD}{steps},1,10,10,0.5,4,1\n")
+    fake_run(tmp_path, "A", other, 0, 1.0)
+    results = load_results(tmp_path)
+    (row,) = against_baselines(results)
+    assert row.gain is None
+    assert mean_curve(results["A"][uneven]) is None
+    assert to_html(load_report(tmp_path), tmp_path / "report.html").count('<svg class="curves"') == 1
+
+
+@pytest.mark.parametrize(("steps", "told"), [((0, 5), "0 after 0"), ((5, 5), "5 after 5"), ((1, 9, 4), "4 after 9")])
+def test_a_curve_whose_steps_do_not_rise_is_refused(steps: tuple[int, ...], told: str, tmp_path: Path) -> None:
+    folder = fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
+    folder.evaluations.write_text(HEAD + "".join(f"{step},1,10,10,0.5,4,1\n" for step in steps))
+    with pytest.raises(ConfigError, match=f"seed_0: evaluations.csv must have steps above 0 that rise, got {told}"):
+        load_results(tmp_path)
 
 
 def test_comparisons_are_tested_over_seeds_and_corrected_together(tmp_path: Path) -> None:
