@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import torch as th
 
-from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import INTERRUPTED, Parser, Several, positive_int, run_command, seed_number
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.commands import INTERRUPTED, Parser, Several, positive_int, python, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.outside import flat_name, folder_name
@@ -37,6 +37,8 @@ ASKED = (
     *("first_seed", "objective", "across_seeds", "threshold", "eval_freq", "n_eval_episodes", "n_final_episodes"),
 )
 """Options that determine what is compared. They are stored with a study; other values are refused later."""
+TRAINING = ("n_timesteps", "eval_freq", "n_eval_episodes", "n_final_episodes")
+"""Those of them that training on a trial's settings may have of its own."""
 DEFAULTS: Plain = {
     "n_seeds": 2,
     "first_seed": 0,
@@ -216,6 +218,8 @@ def open_command_study(args: argparse.Namespace) -> tuple[Study, StudySettings, 
     folder = args.log_folder / name
     storage = args.storage or str(folder / "journal.log")
     given = {"algo": args.algo, "env": task, **asked(args)}
+    if args.trial is not None:  # what training cannot change must be as it is in the search
+        given = {name: value for name, value in given.items() if name not in TRAINING}
     fresh = studies.is_url(storage) or not Path(storage).is_file()
     wanted = new_settings(args) if fresh and args.trial is None else None  # mistakes are reported before a file is made
     if args.trial is not None and not studies.is_url(storage) and not Path(storage).is_file():
@@ -228,9 +232,7 @@ def open_command_study(args: argparse.Namespace) -> tuple[Study, StudySettings, 
     if args.trial is None:
         studies.claim_folder(folder, storage, name not in known)
     with studies.readable(storage):
-        study, settings = studies.open_study(
-            opened, name, studies.shown(storage), wanted, given if args.trial is None else {}
-        )
+        study, settings = studies.open_study(opened, name, studies.shown(storage), wanted, given)
     return study, settings, storage, folder
 
 
@@ -299,14 +301,19 @@ def summarise(study: Study, settings: StudySettings, folder: Path) -> None:
         print(f"note           all {len(done)} trials have the same value; a larger --n-timesteps may tell them apart")
     print(f"best           {settings.objective} {best.value:.4g}   (trial {best.number})")
     print(f"settings       {path}")
-    again = shlex.join(["python", "-m", "sb3_tbc.train", *train_arguments(settings, path, settings.first_seed)])
-    print(f"its curve      {again}")
+    again = shlex.join(train_arguments(settings, path, settings.first_seed, {}))
+    print(f"its curve      {python()} -m sb3_tbc.train {again}")
 
 
-def train_arguments(settings: StudySettings, path: Path, seed: int) -> list[str]:
-    """Arguments of the training command that trains on a trial's settings."""
+def train_arguments(settings: StudySettings, path: Path, seed: int, own: PlainMapping) -> list[str]:
+    """Arguments of the training command that trains on a trial's settings.
+
+    :param own: those of :data:`TRAINING` that are not to be the search's
+    """
     arguments = ["--algo", settings.algo, "--env", settings.env, "--config", str(path), "--seed", str(seed)]
-    arguments += ["--eval-freq", str(settings.eval_freq), "--n-eval-episodes", str(settings.n_eval_episodes)]
+    counts = {"eval_freq": settings.eval_freq, "n_eval_episodes": settings.n_eval_episodes, **own}
+    for name, count in counts.items():
+        arguments += [f"--{name.replace('_', '-')}", str(count)]
     return [*arguments, "--variant", path.stem]
 
 
@@ -321,9 +328,9 @@ def train_from(args: argparse.Namespace, study: Study, settings: StudySettings, 
     seed = settings.seeds.stop if args.seed is None else args.seed
     if seed in settings.seeds:
         print(f"note           seed {seed} is one of those on which the trials were chosen; results on it are biased")
-    arguments = train_arguments(settings, path, seed)
+    own = {name: value for name, value in asked(args).items() if name in TRAINING}
+    arguments = train_arguments(settings, path, seed, own)
     arguments += ["--log-folder", str(folder / "train"), "--device", args.device]
-    arguments += ["--n-timesteps", str(args.n_timesteps)] if args.n_timesteps else []
     return train.command([*arguments, *(["--overwrite"] if args.overwrite else [])])
 
 

@@ -35,6 +35,8 @@ FALLBACK = {"low.actor_learning_rate": "low.learning_rate"}
 """What holds where a setting is not set: an actor without a learning rate of its own has its critics'."""
 FIELDS = ("low", "high", "log", "step", "choices", "keys", "when")
 CIRCUIT = "low.policy_kwargs.ndbc"
+SHARED = "n_timesteps"
+"""Setting that is the same in all trials of a search."""
 
 
 class Suggests(Protocol):
@@ -98,7 +100,9 @@ class Parameter:
             return value in self.choices
         if isinstance(value, bool) or not isinstance(value, int | float) or not self.low <= value <= self.high:
             return False
-        return not self.whole or (float(value).is_integer() and (value - self.low) % int(self.step or 1) == 0)
+        step = self.step or (1 if self.whole else None)
+        place = 0.0 if step is None else (value - self.low) / step
+        return abs(place - round(place)) < 1e-8  # as Optuna tells whether a number lies on the grid
 
     def read(self, run: RunConfig) -> object:
         """The value that corresponds to a configuration's settings, None if there is none."""
@@ -189,7 +193,12 @@ def load_space(algo: str, task: str, extra: Path | None = None) -> dict[str, Pla
             for parameter, fields in sections.get(name, {}).items():
                 merged[parameter] = _over(merged.get(parameter), fields)
     space = {name: fields for name, fields in merged.items() if fields is not None}
-    build_space(space)
+    for searched in build_space(space):
+        if SHARED in {*searched.keys, *(key for settings in searched.sets.values() for key in settings)}:
+            raise ConfigError(
+                f"search parameter {searched.name}: {SHARED} cannot be searched, because trials are compared after "
+                "equal numbers of steps; give --n-timesteps"
+            )
     return space
 
 
@@ -206,13 +215,24 @@ def build_space(declared: Mapping[str, PlainMapping]) -> Space:
 
     :raises ConfigError: naming the parameter and what is wrong with it
     """
-    space: list[Parameter] = []
+    space: dict[str, Parameter] = {}
     for name, fields in declared.items():
         parameter = _parameter(name, fields)
-        if parameter.when and parameter.when[0] not in {p.name for p in space}:
-            raise ConfigError(f"search parameter {name}: 'when' must name a parameter above it, got {fields['when']!r}")
-        space.append(parameter)
-    return tuple(space)
+        if parameter.when:
+            _check_condition(parameter, space)
+        space[name] = parameter
+    return tuple(space.values())
+
+
+def _check_condition(parameter: Parameter, above: Mapping[str, Parameter]) -> None:
+    """Refuse a condition that nothing can meet: its parameter would never be searched."""
+    other, value = parameter.when or ("", None)
+    where = f"search parameter {parameter.name}: 'when' must name"
+    if other not in above:
+        cure = f"take the condition away with {parameter.name}: {{when: null}}"
+        raise ConfigError(f"{where} a parameter above it that is searched, got {other!r}; {cure}")
+    if not above[other].holds(value):
+        raise ConfigError(f"{where} a value that {other} can have, got {value!r}")
 
 
 def _parameter(name: str, fields: object) -> Parameter:
@@ -222,15 +242,17 @@ def _parameter(name: str, fields: object) -> Parameter:
     for key in fields:
         if key not in FIELDS:
             raise ConfigError(f"{where}: unknown field {key!r}; {nearest(str(key), FIELDS)}")
-    keys = tuple(fields.get("keys") or ((name,) if name != SCHEDULE else RATES))
+    keys = fields.get("keys") or ([name] if name != SCHEDULE else list(RATES))
+    if not isinstance(keys, list) or not all(isinstance(key, str) for key in keys):
+        raise ConfigError(f"{where}: keys must be a list of settings, e.g. [low.tau, high.tau], got {keys!r}")
     when = fields.get("when")
     if when is not None and not (isinstance(when, Mapping) and len(when) == 1):
         raise ConfigError(f"{where}: 'when' takes one parameter and its value, got {when!r}")
     condition = next(iter(when.items())) if when else None
     choices = fields.get("choices")
     if choices is not None:
-        return _choice(name, keys, choices, condition, where)
-    return _range(name, keys, fields, condition, where)
+        return _choice(name, tuple(keys), choices, condition, where)
+    return _range(name, tuple(keys), fields, condition, where)
 
 
 def _range(
@@ -239,6 +261,8 @@ def _range(
     low, high, log, step = (fields.get(key) for key in ("low", "high", "log", "step"))
     if not _is_number(low) or not _is_number(high) or not low <= high:
         raise ConfigError(f"{where} needs low and high with low <= high, or choices, got {dict(fields)}")
+    if not isinstance(log, bool | None):
+        raise ConfigError(f"{where}: log must be true or false, got {log!r}")
     if log and low <= 0:
         raise ConfigError(f"{where}: a logarithmic range must begin above 0, got {low}")
     if step is not None and (not _is_number(step) or step <= 0):

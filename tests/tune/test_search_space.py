@@ -180,6 +180,12 @@ def test_a_value_outside_of_a_range_is_left_out() -> None:
     assert project(space, run) == {"max_options": 5}
 
 
+def test_a_value_between_the_steps_of_a_range_is_left_out() -> None:
+    run = load_config("tbc-hrl", "Pendulum", overrides={"low": {"gamma": 0.97}})
+    for step, found in ((0.02, {}), (0.01, {"low.gamma": 0.97})):
+        assert project(build_space({"low.gamma": {"low": 0.9, "high": 0.99, "step": step}}), run) == found
+
+
 def test_the_users_file_changes_ranges(tmp_path: Path) -> None:
     path = tmp_path / "mine.yml"
     path.write_text("default: {tau: {high: 2e-1}, memory: null}\nPendulum: {batch_size: {low: 64, high: 128}}\n")
@@ -258,6 +264,20 @@ def test_whole_floats_are_ends_of_whole_ranges(tmp_path: Path) -> None:
         ("default: {low.lerning_rate: {low: 1, high: 2}}", r"unknown setting 'low.lerning_rate'; did you mean"),
         ("default: {memory: {choices: [window, both]}}", r"memory must be one of"),
         ("default: {low.ent_coef: {when: {low.temp: fixed}}}", r"'when' must name a parameter above it"),
+        (
+            "default: {low.temperature: null}",
+            r"take the condition away with low\.ent_coef: {when: null}",
+        ),
+        (
+            "default: {low.ent_coef: {when: {low.temperature: fixd}}}",
+            r"a value that low\.temperature can have, got 'fixd'",
+        ),
+        ("default: {low.gamma: {low: .9, high: 1, when: {max_options: 500}}}", r"that max_options can have, got 500"),
+        ("default: {low.gamma: {low: .9, high: .99, log: 'no'}}", r"log must be true or false, got 'no'"),
+        ("default: {x: {low: .9, high: .99, keys: low.gamma}}", r"keys must be a list of settings.*got 'low\.gamma'"),
+        ("default: {x: {low: .9, high: .99, keys: [3]}}", r"keys must be a list of settings.*got \[3\]"),
+        ("default: {n_timesteps: {low: 1000, high: 2000}}", r"n_timesteps cannot be searched.*give --n-timesteps"),
+        ("default: {x: {choices: {a: {n_timesteps: 9}}}}", r"x: n_timesteps cannot be searched"),
         ("default: {learning_rate_schedule: {choices: [cosine]}}", r"must be among constant, linear"),
         ("default: {learning_rate_schedule: {keys: [low.tau]}}", r"keys must be among low\.learning_rate, low\.actor"),
         ("default: {learning_rate_schedule: {low: 0, high: 1}}", r"learning_rate_schedule needs choices"),

@@ -133,15 +133,17 @@ def test_the_best_trial_trains_again_to_the_same_curve(searched: Path, tmp_path:
 @pytest.mark.parametrize("which", ["0", "1", "best"])
 def test_train_from_a_trial(searched: Path, which: str, capsys: pytest.CaptureFixture[str]) -> None:
     more = ["--seed", "1"] if which == "0" else []
-    assert tune.main(arguments(searched, "--trial", which, "--n-timesteps", "100", "--overwrite", *more)) == 0
+    own = ["--n-timesteps", "100", "--eval-freq", "50", "--n-eval-episodes", "1", "--n-final-episodes", "3"]
+    assert tune.main(arguments(searched, "--trial", which, "--overwrite", *own, *more)) == 0
     assert ("seed 1 is one of those on which the trials were chosen" in capsys.readouterr().out) == bool(more)
     seed = 1 if more else 2  # by default one on which nothing was chosen
     study = load(searched)
     number = find_trial(study, which).number
     runs = list((searched / NAME / "train").glob(f"*/tbc-hrl/trial_{number:04d}/seed_{seed}/config.yml"))
     assert len(runs) == 1
-    model = yaml.safe_load(runs[0].read_text())["model"]
-    assert model == read_settings(study).config_of(study.trials[number]).model
+    made = yaml.safe_load(runs[0].read_text())
+    assert [str(made[name[2:].replace("-", "_")]) for name in own[::2]] == own[1::2]
+    assert made["model"] == read_settings(study).config_of(study.trials[number]).model
 
 
 def test_resuming_needs_no_options_and_counts_what_is_done(searched: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -163,6 +165,8 @@ def test_resuming_needs_no_options_and_counts_what_is_done(searched: Path, capsy
         (["--objective", "final"], "begun with other options: --objective is auc there, not final"),
         (["--n-seeds", "3"], "--n-seeds is 2 there, not 3"),
         (["--hyperparams", "low.tau:0.1"], "--hyperparams is ['compile:false'"),
+        (["--trial", "best", "--algo", "hits", "--study-name", NAME], "--algo is tbc-hrl there, not hits"),
+        (["--trial", "best", "--hyperparams", "low.gamma:0.5"], "--hyperparams is ['compile:false'"),
         (["--trial", "99"], "a trial's number (0 to"),
         (["--trial", "last"], "--trial must be 'best' or a trial's number"),
         (["--trial", "best", "--study-name", "other"], "no study 'other'"),
