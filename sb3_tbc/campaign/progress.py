@@ -10,6 +10,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from sb3_tbc.campaign.jobs import Job
+from sb3_tbc.errors import ConfigError
 
 EVERY = 2.0
 """Seconds between two looks into the runs' folders."""
@@ -50,7 +51,10 @@ class Board:
             return
         self._looked = time.monotonic()
         for job in running:
-            rows = job.folder.read_evaluations()
+            try:
+                rows = job.folder.read_evaluations()
+            except ConfigError:  # damaged: the run itself tells it, and ends no other
+                continue
             if rows and job in self.tasks:
                 said = f"{rows[-1].timesteps:,} steps, success {rows[-1].success_rate:.2f}"
                 self.bars.update(self.tasks[job], completed=rows[-1].timesteps, said=said)

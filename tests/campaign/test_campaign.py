@@ -310,6 +310,9 @@ def test_bars_on_a_terminal(tmp_path: Path) -> None:
         job.folder.evaluations.write_text(lines)
         board.show([job])
         board.bars.refresh()
+        job.folder.evaluations.write_text("timesteps\n500\n")
+        board._looked = 0.0
+        board.show([job])  # a damaged curve ends no campaign
     assert "400 steps, success 0.25" in said.getvalue()
 
 
