@@ -186,6 +186,21 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
+def in_use(folder: Path) -> bool:
+    """Whether a process holds the lock of a folder."""
+    try:
+        handle = os.open(folder / LOCK, os.O_RDWR)
+    except OSError:
+        return False
+    try:
+        _lock(handle, folder / LOCK)
+    except FolderInUseError:
+        return True
+    finally:
+        os.close(handle)
+    return False
+
+
 def remove_stale_lock(folder: Path) -> None:
     """Remove the lock's file if its holder was killed; where nobody may write, or somebody holds it, it stays."""
     if (folder / LOCK).exists():

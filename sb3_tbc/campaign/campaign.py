@@ -9,8 +9,9 @@ from collections.abc import Callable, Sequence
 from sb3_tbc.campaign.executors import Executor, Handle
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.campaign.progress import Board
-from sb3_tbc.commands import FAILED, INTERRUPTED
+from sb3_tbc.commands import FAILED, INTERRUPTED, USER_MISTAKE
 from sb3_tbc.errors import ConfigError, WriteError
+from sb3_tbc.files import in_use
 from sb3_tbc.outside import one_line
 from sb3_tbc.zoo.runner import RunSpec
 
@@ -31,6 +32,7 @@ class Campaign:
 
     def __init__(self, executor: Executor, workers: int, board: Board, wanted: Callable[[Job], RunSpec]) -> None:
         self.executor, self.workers, self.board, self.wanted = executor, workers, board, wanted
+        self.waiting: deque[Job] = deque()
         self.running: dict[Job, Handle] = {}
         self.log_sizes: dict[Job, int] = {}  # before the run began: what earlier attempts wrote, in bytes
         self.failed: list[Job] = []
@@ -41,11 +43,10 @@ class Campaign:
 
         :raises KeyboardInterrupt: after Ctrl-C, when the runs are stopped
         """
-        waiting = deque(todo)
+        self.waiting.extend(todo)
         try:
-            while waiting or self.running:
-                while waiting and len(self.running) < self.workers:
-                    self._begin(waiting.popleft())
+            while self.waiting or self.running:
+                self._begin_free()
                 for job, handle in list(self.running.items()):
                     status = handle.poll()
                     if status is not None:
@@ -57,6 +58,17 @@ class Campaign:
             self._stop()
             raise
         return self.failed
+
+    def _begin_free(self) -> None:
+        """Begin waiting runs while there are workers; one that another process is at is waited for."""
+        for job in list(self.waiting):
+            if len(self.running) >= self.workers:
+                return
+            if not job.target.finished and in_use(job.folder.path):
+                self.board.wait(job)
+            else:
+                self.waiting.remove(job)
+                self._begin(job)
 
     def _begin(self, job: Job) -> None:
         if job.target.finished:  # another campaign was faster
@@ -82,6 +94,9 @@ class Campaign:
                 self._fail(job, status, f"its result cannot be copied: {one_line(error)}")
             else:
                 self.board.done(job)
+        elif status == USER_MISTAKE and in_use(job.folder.path):  # another process began it in the same moment
+            self.waiting.append(job)
+            self.board.wait(job)
         elif status == INTERRUPTED:
             self.stopped.append(job)
             self.board.stopped(job)

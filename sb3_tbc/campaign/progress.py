@@ -30,6 +30,7 @@ class Board:
                              disable=not self.console.is_terminal)  # fmt: skip
         self.all = self.bars.add_task("all runs", total=total, said=f"0 of {total}")
         self.tasks: dict[Job, TaskID] = {}
+        self.waiting: set[Job] = set()
         self.ended, self.total = 0, total
         self._looked = 0.0
 
@@ -44,6 +45,14 @@ class Board:
         """A run begins."""
         self._say(f"begin   {job.name}   (log: {job.log})")
         self.tasks[job] = self.bars.add_task(escape(job.name), total=job.n_timesteps or None, said="")
+
+    def wait(self, job: Job) -> None:
+        """Another process is at a run; said once."""
+        if job in self.tasks:
+            self.bars.remove_task(self.tasks.pop(job))
+        if job not in self.waiting:
+            self.waiting.add(job)
+            self._say(f"waits   {job.name}   (another process is at it)")
 
     def show(self, running: Iterable[Job]) -> None:
         """Read from the runs' folders how far they are."""

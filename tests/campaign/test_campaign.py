@@ -24,6 +24,7 @@ from sb3_tbc.campaign.jobs import FAILED, Job
 from sb3_tbc.campaign.progress import Board
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import MissingExtraError
+from sb3_tbc.files import locked
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.ledger import LEDGER_FILES, RunFolder
 from sb3_tbc.zoo.runner import RunSpec
@@ -180,6 +181,42 @@ def test_what_another_campaign_finished_meanwhile_is_done(tmp_path: Path) -> Non
     assert failed == []
     assert executor.jobs == [0, 2]
     assert said.count("done    ") == 3
+
+
+def test_a_run_that_another_process_is_at_is_waited_for(tmp_path: Path) -> None:
+    held, late, free = (make_job(tmp_path, seed) for seed in range(3))
+    locks = {}
+
+    def hold(job: Job) -> None:
+        locks[job] = locked(job.folder.path)
+        locks[job].__enter__()
+
+    def start(job: Job) -> Finished:
+        if job == late and job not in locks:
+            hold(job)  # another process was faster by a moment
+            return Finished(2)
+        finish(job)
+        return Finished(0)
+
+    class Others(Board):
+        looks = 0
+
+        def show(self, running: object) -> None:
+            self.looks += 1
+            if self.looks == 3:
+                finish(held)
+                for lock in locks.values():
+                    lock.__exit__(None, None, None)
+
+    hold(held)
+    executor, said = Scripted(start), io.StringIO()
+    with Others(3, Console(file=said, width=300)) as board:
+        failed = Campaign(executor, 1, board, wanted).run([held, late, free])  # type: ignore[arg-type]
+    assert failed == []
+    assert executor.jobs == [1, 2, 1]
+    assert [said.getvalue().count(f"waits   {job.name}") for job in (held, late, free)] == [1, 1, 0]
+    assert said.getvalue().count("done    ") == 3
+    assert not list((tmp_path / "results").rglob(FAILED))
 
 
 def test_a_result_that_cannot_be_kept_is_a_failed_run_and_ends_no_other(tmp_path: Path) -> None:
