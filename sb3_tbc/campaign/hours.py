@@ -84,13 +84,14 @@ def _mean_length(folder: RunFolder) -> float | None:
 
 
 def hours_of(job: Job, speeds: Speeds) -> float | None:
-    """Hours that a run takes, see :func:`without_evaluations`; ``None`` if nothing is known of its task."""
+    """Hours that a run still takes, see :func:`without_evaluations`; ``None`` if nothing is known of its task."""
+    left = job.steps_left / job.n_timesteps if job.n_timesteps else 1.0
     key = _measured(job, speeds)
     if key is not None:
         evaluated = job.n_episodes * _episode(job, speeds) / speeds.evaluate[key]
-        return (job.n_timesteps / speeds.train[key] + evaluated) / 3600
+        return left * (job.n_timesteps / speeds.train[key] + evaluated) / 3600
     speed = _of_task(job, speeds.whole)
-    return job.n_timesteps / speed / 3600 if speed else None
+    return left * job.n_timesteps / speed / 3600 if speed else None
 
 
 def without_evaluations(job: Job, speeds: Speeds) -> bool:
@@ -125,11 +126,16 @@ def hours_together(hours: Sequence[float], workers: int) -> float:
     return max(ends)
 
 
+def _steps(job: Job) -> str:
+    whole = f"{job.n_timesteps:,} steps"
+    return whole if job.steps_left == job.n_timesteps else f"{job.steps_left:,} of {whole} left"
+
+
 def plan(todo: Sequence[Job], workers: int, speeds: Speeds) -> list[str]:
     """What ``--dry-run`` prints: every run with its hours, and the sum."""
     hours = [hours_of(job, speeds) for job in todo]
     lines = [
-        f"to do   {job.name}   {job.n_timesteps:,} steps, {'hours unknown' if h is None else f'{h:.2f} h'}"
+        f"to do   {job.name}   {_steps(job)}, {'hours unknown' if h is None else f'{h:.2f} h'}"
         for job, h in zip(todo, hours, strict=True)
     ]
     known = [h for h in hours if h is not None]

@@ -13,6 +13,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_atomic
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json
+from sb3_tbc.zoo.checkpoints import steps_done
 from sb3_tbc.zoo.ledger import RunFolder, to_json
 from sb3_tbc.zoo.runner import RunSpec
 
@@ -71,6 +72,13 @@ class Job:
     def holds_run(self) -> bool:
         """Whether the folder holds a run that would be copied or continued, and not replaced."""
         return self.folder.finished or self.folder.resumable
+
+    @property
+    def steps_left(self) -> int:
+        """Environment steps still to do: of a stopped run those after its checkpoint, of a finished one none."""
+        if self.folder.finished:
+            return 0
+        return max(self.n_timesteps - steps_done(self.folder.path), 0) if self.folder.resumable else self.n_timesteps
 
     def require(self, wanted: RunSpec) -> None:
         """Refuse a folder with another run: its result is none of the campaign's.

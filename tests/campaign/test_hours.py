@@ -57,6 +57,24 @@ def test_a_plan_waits_for_its_longest_run(tmp_path: Path) -> None:
     assert "2.0 hours of one core at measured speeds, evaluations included; about 1.0 hours with 40" in plans[-1]
 
 
+def test_of_a_stopped_run_the_rest_counts(tmp_path: Path) -> None:
+    speeds = Speeds({}, {}, {}, {("Pendulum", ""): 1000 / 3600})
+    stopped, trained, damaged = (make_job(tmp_path, seed) for seed in range(3))
+    for job in (stopped, trained, damaged):
+        job.folder.start({}, "x")
+        job.folder.checkpoint.mkdir()
+        (job.folder.checkpoint / "state.json").write_text('{"timesteps": 750}')
+    trained.folder.finish({})  # only its copy into the ledger is missing
+    (damaged.folder.checkpoint / "state.json").write_text('{"timesteps')
+    assert [hours_of(job, speeds) for job in (stopped, trained, damaged)] == [0.25, 0.0, 1.0]
+    lines = plan([stopped, trained, damaged], 1, speeds)
+    assert [line.split("   ")[2] for line in lines[:3]] == [
+        "250 of 1,000 steps left, 0.25 h",
+        "0 of 1,000 steps left, 0.00 h",
+        "1,000 steps, 1.00 h",
+    ]
+
+
 def test_hours_without_evaluations_are_not_said_to_include_them(tmp_path: Path) -> None:
     rows = {("Pendulum", "hits"): 1000 / 3600}
     job = replace(make_job(tmp_path), n_episodes=100)
