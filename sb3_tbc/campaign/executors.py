@@ -146,7 +146,8 @@ class SlurmExecutor:
         try:
             self.executor = submitit.AutoExecutor(folder=folder, cluster=cluster)
             self.executor.update_parameters(**{"cpus_per_task": 1, "timeout_min": 24 * 60, **settings})
-        except (RuntimeError, NameError, TypeError, ValueError) as error:
+        # submitit asserts the kinds of its settings
+        except (RuntimeError, NameError, TypeError, ValueError, AssertionError) as error:
             raise ConfigError(f"--executor slurm: {error}") from error
 
     def start(self, job: Job) -> SlurmHandle:

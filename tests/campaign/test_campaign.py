@@ -442,3 +442,5 @@ def test_without_a_slurm_cluster_it_is_one_line(tmp_path: Path, monkeypatch: pyt
         SlurmExecutor(tmp_path / "slurm", {})
     with pytest.raises(ConfigError, match="--executor slurm: "):
         SlurmExecutor(tmp_path / "slurm", {"no_such_setting": 1}, cluster="local")
+    with pytest.raises(ConfigError, match=r"--executor slurm: .*timeout_min"):
+        SlurmExecutor(tmp_path / "slurm", {"timeout_min": "2h"}, cluster="local")
