@@ -15,6 +15,7 @@ from typing import IO, Any, Protocol
 
 from sb3_tbc.aliases import PlainMapping
 from sb3_tbc.campaign.jobs import Job
+from sb3_tbc.commands import INTERRUPTED
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 
@@ -86,6 +87,17 @@ def run_job(job: Job) -> int:
             raise
 
 
+def run_slurm_job(job: Job) -> int:
+    """Carry out a run; at the job's time limit submitit ends it with ``SystemExit``, when the run has saved itself.
+
+    :return: exit status of the training command
+    """
+    try:
+        return run_job(job)
+    except SystemExit:
+        return INTERRUPTED
+
+
 class LocalHandle:
     """A process on this machine."""
 
@@ -153,7 +165,7 @@ class SlurmExecutor:
     def start(self, job: Job) -> SlurmHandle:
         """Submit a run."""
         self.executor.update_parameters(name=f"{job.env}-{job.algo}-{job.seed}".replace("/", "_"))
-        return SlurmHandle(self.executor.submit(run_job, job))
+        return SlurmHandle(self.executor.submit(run_slurm_job, job))
 
     def close(self) -> None:
         """Nothing to let go of: Slurm keeps its queue."""

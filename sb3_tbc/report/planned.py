@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_yaml
 from sb3_tbc.report.runs import SHIPPED, Results, Run
 from sb3_tbc.zoo.config import N_EVAL_EPISODES, OF_PAPER, default_eval_freq, load_config
@@ -100,10 +101,26 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
 def _rows(plan: Plain) -> Iterator[Planned]:
     for row in plan["runs"]:
         first, count = int((row if "first_seed" in row else plan)["first_seed"]), int(row["seeds"])
-        options = [str(word) for word in (row if "options" in row else plan).get("options") or ()]
+        options = _words((row if "options" in row else plan).get("options") or [])
         steps = int(row["n_timesteps"]) if "n_timesteps" in row else None
+        if first < 0 or count < 1 or (steps is not None and steps < 1):
+            raise ConfigError(f"first_seed is 0 or more, seeds and n_timesteps are 1 or more, got {one_line(row)}")
         for method in row["methods"]:
             yield Planned(str(row["task"]), str(method), range(first, first + count), steps, options)
+
+
+def _words(options: object) -> list[str]:
+    """Options of a command as single words; ``--name=value`` becomes two.
+
+    :raises ConfigError: if they are no list, or change the number of steps, which is told of runs that are finished
+    """
+    if not isinstance(options, list):
+        raise ConfigError(f"options must be a list of words, as [--eval-freq, '5000'], got {one_line(repr(options))}")
+    texts = map(str, options)
+    words = [part for text in texts for part in (text.split("=", 1) if text.startswith("--") else [text])]
+    if "--n-timesteps" in words:
+        raise ConfigError("options must not hold --n-timesteps: give n_timesteps in the row")
+    return words
 
 
 def _check_equal(rows: list[Planned]) -> None:

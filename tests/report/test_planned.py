@@ -71,6 +71,33 @@ def test_runs_made_otherwise_than_planned_do_not_count(tmp_path: Path) -> None:
     assert missing_table(tmp_path, load_results(tmp_path))[1][2] == "1 of 4"
 
 
+def test_options_of_a_plan_may_be_written_with_a_sign_of_equality(tmp_path: Path) -> None:
+    fake_run(tmp_path, "Pendulum", "tbc-hrl", 0, 1.0, config={"n_timesteps": 200_000, "eval_freq": 50})
+    rows = "{task: Pendulum, seeds: 1, options: [--eval-freq=50, --n-eval-episodes=10], methods: [tbc-hrl, hits]}"
+    (tmp_path / "campaign.yml").write_text(f"{{first_seed: 0, runs: [{rows}]}}")
+    _, (*said, command) = missing_table(tmp_path, load_results(tmp_path))
+    assert said == ["Pendulum", "hits", "0 of 1"]
+    assert command.endswith("--eval-freq 50 --n-eval-episodes 10")
+
+
+@pytest.mark.parametrize(
+    ("row", "told"),
+    [
+        ("seeds: 1, options: --eval-freq 50", "options must be a list of words.*got '--eval-freq 50'"),
+        ("seeds: 1, options: [--n-timesteps, 500]", "options must not hold --n-timesteps"),
+        ("seeds: 0", "seeds and n_timesteps are 1 or more"),
+        ("seeds: 1, first_seed: -1", "first_seed is 0 or more"),
+        ("seeds: 1, n_timesteps: -3", "n_timesteps are 1 or more"),
+    ],
+)
+def test_plans_that_mean_nothing(row: str, told: str, tmp_path: Path) -> None:
+    fake_run(tmp_path, "Pendulum", "tbc-hrl", 0, 1.0)
+    rows = f"{{task: Pendulum, {row}, methods: [tbc-hrl]}}"
+    (tmp_path / "campaign.yml").write_text(f"{{first_seed: 0, runs: [{rows}]}}")
+    with pytest.raises(ConfigError, match=told):
+        missing_table(tmp_path, load_results(tmp_path))
+
+
 def test_plans_that_evaluate_a_task_at_other_steps_are_refused(tmp_path: Path) -> None:
     fake_run(tmp_path, "Pendulum", "tbc-hrl", 0, 1.0)
     plan = tmp_path / "campaign.yml"
