@@ -88,13 +88,16 @@ def run_job(job: Job) -> int:
 
 
 def run_slurm_job(job: Job) -> int:
-    """Carry out a run; at the job's time limit submitit ends it with ``SystemExit``, when the run has saved itself.
+    """Carry out a run; at the job's time limit submitit raises an error in it, and the run has saved itself.
+
+    A job that is preempted ends with ``SystemExit``: Slurm begins it again, so it must leave no result.
 
     :return: exit status of the training command
     """
+    submitit = require("submitit", extra="cluster", what="--executor slurm")
     try:
         return run_job(job)
-    except SystemExit:
+    except submitit.core.utils.UncompletedJobError:
         return INTERRUPTED
 
 
