@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import zlib
 from collections.abc import Callable
 from importlib.resources import files
 
@@ -29,10 +30,10 @@ def to_c(policy: ExportedPolicy) -> str:
         "REACHED": _reached(policy),
         "EVENT": ""
         if policy.event is None
-        else f"\n        || (state->elapsed > 0 && observation[{policy.event}] > 0.5f)",
+        else f"\n        || (next.elapsed > 0 && observation[{policy.event}] > 0.5f)",
         "HIGH_INPUTS": _high_inputs(policy),
         "FORGET": {"window": "over", "episode": "started", "none": "1"}[policy.memory],
-        "ASKED": "(state->subgoal[i] - here[i])" if policy.relative_subgoals else "state->subgoal[i]",
+        "ASKED": "(next.subgoal[i] - here[i])" if policy.relative_subgoals else "next.subgoal[i]",
         "UNITS": str(policy.subgoal_dim + (policy.fixed_budget is None)),
         "BUDGET": _budget(policy),
         "REMAINING": _REMAINING if policy.remaining_time else "",
@@ -41,13 +42,15 @@ def to_c(policy: ExportedPolicy) -> str:
     text = _template("policy.c")
     for name, value in values.items():
         text = text.replace(f"@{name}@", value)
-    return text
+    return text.replace("@GUARD@", f"TBC_POLICY_{zlib.crc32(text.encode()):08x}")
 
 
 def _budget(policy: ExportedPolicy) -> str:
     if policy.fixed_budget is not None:
         return repr(policy.fixed_budget)
-    return f"fmax(rint({_CHOSEN}), 1.0)" if policy.whole_budgets else _CHOSEN
+    if not policy.whole_budgets:
+        return _CHOSEN
+    return f"rint({_CHOSEN});\n    state->time_budget = state->time_budget < 1.0 ? 1.0 : state->time_budget"
 
 
 def _template(name: str) -> str:
@@ -89,8 +92,8 @@ def array(name: str, values: FloatArray, kind: str = "tbc_real") -> str:
 
 def exact(name: str, values: FloatArray) -> str:
     """A constant array in double precision, for products that single precision would round."""
-    listed = ", ".join(repr(float(v)) for v in np.asarray(values, np.float64).ravel())
-    return f"static const tbc_real {name}[{max(1, np.size(values))}] = {{{listed or '0.0'}}};\n"
+    listed = ", ".join(f"(tbc_real){float(v)!r}" for v in np.asarray(values, np.float64).ravel())
+    return f"static const tbc_real {name}[{max(1, np.size(values))}] = {{{listed or '0.0f'}}};\n"
 
 
 def _indices(name: str, values: NDArray[np.integer]) -> str:
@@ -154,7 +157,7 @@ def _dissipative(c: Dissipative) -> str:
 _CHOSEN = """TBC_DT_MIN
         + 0.5 * ((double)(float)squash(unit[TBC_SUBGOAL], TBC_HIGH_BOUND) + 1.0) * (TBC_DT_MAX - TBC_DT_MIN)"""
 _REMAINING = """
-    seen[TBC_LOW_INPUT - 1] = (float)fmax(0.0, fmin((state->time_budget - state->elapsed) / TBC_DT_MAX, 1.0));"""
+    seen[TBC_LOW_INPUT - 1] = (float)fmax(0.0, fmin((next.time_budget - next.elapsed) / TBC_DT_MAX, 1.0));"""
 _LOW_MLP = """
 void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT], int closed_form,
                   float mean[TBC_ACTION])
@@ -193,7 +196,7 @@ def _mlp(name: str, mlp: MLP) -> str:
     return f"{text}\n{dense}\nstatic void {name}_network(const float *x, float *y)\n{{\n{body}}}\n"
 
 
-_RULES = {"linear": "sum", "relu": "(sum > 0 ? sum : 0)", "tanh": "TBC_TANH(sum)"}
+_RULES = {"linear": "sum", "relu": "(sum < 0 ? 0 : sum)", "tanh": "TBC_TANH(sum)"}
 _DENSE = """
 static void @NAME@_dense_@KIND@(int inputs, int outputs, const tbc_real *w, const tbc_real *b, const tbc_real *x,
                                 tbc_real *y)
@@ -231,9 +234,12 @@ def _coordinate(index: int, c: Coordinate) -> str:
     if c.kind == "wrap":
         return f"    here[{index}] = (tbc_real)fmod(entries[{c.first}], {c.high!r});"
     value = f"entries[{c.first}]"
-    value = f"fmin({value}, {c.high!r})" if np.isfinite(c.high) else value
-    value = f"fmax({value}, {c.low!r})" if np.isfinite(c.low) else value
-    return f"    here[{index}] = (tbc_real){value};"
+    clipped = value  # NaN stays NaN, which fmin and fmax would swallow
+    if np.isfinite(c.low):
+        clipped = f"({value} < {c.low!r} ? {c.low!r} : {clipped})"
+    if np.isfinite(c.high):
+        clipped = f"({value} > {c.high!r} ? {c.high!r} : {clipped})"
+    return f"    here[{index}] = (tbc_real){clipped};"
 
 
 def _reached(policy: ExportedPolicy) -> str:

@@ -34,7 +34,10 @@ def initial_state() -> State:
 
 
 def step(observation: Array, achieved_goal: Array, desired_goal: Array, state: State) -> tuple[Array, State]:
-    """One control step: the action in the environment's units, and the next state."""
+    """One control step: the action in the environment's units, and the next state.
+
+    Where an input is NaN, so is the action: go on from the former state then.
+    """
     observation, achieved_goal, desired_goal = (
         np.asarray(part, np.float32).astype(np.float64) for part in (observation, achieved_goal, desired_goal)
     )

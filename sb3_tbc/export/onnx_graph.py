@@ -63,8 +63,8 @@ def to_onnx(policy: ExportedPolicy) -> onnx.ModelProto:
 
     State tensors are ``subgoal`` (task units), ``time_budget`` and ``elapsed`` (control steps; ``elapsed`` is -1 before
     the first option), all three float64, and ``membrane``, float32; the next ones are called ``next_<name>``. Start an
-    episode with elapsed -1 and zeros elsewhere. All arithmetic is in double precision, rounded at the same places as in
-    the agent.
+    episode with elapsed -1 and zeros elsewhere. Where an input is NaN, so is the action: go on from the former state.
+    All arithmetic is in double precision, rounded at the same places as in the agent.
 
     :param policy: what to export
     """

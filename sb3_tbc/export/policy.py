@@ -340,7 +340,10 @@ def read_circuit(net: NDBCNet, n_actions: int) -> Circuit | Dissipative:
 
 
 def _numpy(tensor: th.Tensor) -> NDArray[np.float32]:
-    return np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32).copy()
+    array = np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32).copy()
+    if not np.isfinite(array).all():
+        raise ConfigError("an agent with weights that are NaN or infinite cannot be exported; take an earlier one")
+    return array
 
 
 class _Probe:

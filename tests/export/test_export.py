@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from test_events import Bell
+from exported import CASES, PENDULUM, make, needs_cc, trained_look
 
 import sb3_tbc.export.command
 from sb3_tbc import TBCHRL, train
@@ -34,36 +34,8 @@ from sb3_tbc.ndbc.closed_form import ClosedFormNDBC
 from sb3_tbc.tbc_hrl import HAC
 from sb3_tbc.zoo.algorithms import load_two_levels
 
-needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
 ANT = {"inter": 12, "command": 10, "motor": 8, "sensory_fanout": 5, "inter_fanout": 8,
        "recurrent_command_synapses": 2, "motor_fanin": 6}  # fmt: skip
-PENDULUM = {"inter": 6, "command": 6, "motor": 1, "sensory_fanout": 3, "inter_fanout": 4,
-            "recurrent_command_synapses": 1, "motor_fanin": 4}  # fmt: skip
-DISSIPATIVE = {**PENDULUM, "dynamics": "dissipative", "max_rho": 0.97}
-LEAN = {**PENDULUM, "synapses": "lean"}
-REFLEX = {**PENDULUM, "sensory_to": ["inter", "command", "motor"]}
-CASES = {
-    "reached": ("Pendulum", {"window_end": "reached", "memory": "window"}),
-    "relative": ("UR5Reacher", {"window_end": "reached", "relative_subgoals": True, "memory": "episode", "dt_min": 3}),
-    "whole": ("Pendulum", {"whole_budgets": True, "memory": "window"}),
-    "mlp": ("Pendulum", {"window_end": "timed", "memory": "none", "low": {"policy_kwargs": {"ndbc": None}}}),
-    "memoryless": ("Pendulum", {"memory": "none"}),
-    "hac": ("Pendulum", {}),
-    "dissipative": ("Pendulum", {"memory": "window", "low": {"policy_kwargs": {"ndbc": DISSIPATIVE}}}),
-    "lean": ("Pendulum", {"window_end": "reached", "memory": "window", "low": {"policy_kwargs": {"ndbc": LEAN}}}),
-    "reflex": ("Pendulum", {"memory": "window", "low": {"policy_kwargs": {"ndbc": REFLEX}}}),
-    "lean reflex": ("Pendulum", {"memory": "episode", "low": {"policy_kwargs": {"ndbc": {**REFLEX, **LEAN}}}}),
-    "event": ("Bell", {"dt_max": 12.0, "memory": "window"}),
-}
-
-
-def make(case: str) -> tuple[TBCHRL, gym.Env]:
-    task, kwargs = CASES[case]
-    env = Bell() if task == "Bell" else gym.make(f"sb3_tbc/{task}-v0")
-    small = {"policy_kwargs": {"net_arch": [12, 8]}}
-    algorithm = HAC if case == "hac" else TBCHRL
-    model = algorithm("MultiInputPolicy", env, seed=1, compile=False, **{"high": small, **kwargs})
-    return model, env
 
 
 @pytest.fixture(scope="module")
@@ -84,21 +56,6 @@ def test_it_acts_as_predict_does_over_a_thousand_steps(case: str, kind: str, tmp
     result = compare(model, player, env, 1000)
     assert result.max_difference < 1e-5
     assert result.windows >= 20
-
-
-def trained_look(model: TBCHRL, seed: int = 0) -> TBCHRL:
-    """Weights as training leaves them: large, some neurons almost without inertia, some logistics almost steps."""
-    generator = th.Generator().manual_seed(seed)
-    for level in (model.high, model.low):
-        with th.no_grad():
-            for name, p in level.policy.average_actor.named_parameters():
-                p.mul_(4.0 if level is model.high else 3.0).add_(0.3 * th.randn(p.shape, generator=generator))
-                if name.endswith("raw_capacitance"):
-                    p[::2] = -13.8  # a capacitance of 1e-6
-                if name.endswith("raw_gain"):
-                    p[::2] = 12.0
-        level.refresh()
-    return model
 
 
 @pytest.mark.parametrize("kind", ["numpy", "onnx", pytest.param("c", marks=needs_cc)])
@@ -330,6 +287,15 @@ def test_an_unknown_subgoal_formula_is_refused() -> None:
         probe.selection(lambda o: np.clip(o["observation"][..., 1:2], -1, 1))
     with pytest.raises(ConfigError, match="from desired_goal"):
         probe.selection(lambda o: np.concatenate([o["observation"], o["desired_goal"][..., :1]], axis=-1))
+
+
+@pytest.mark.parametrize("level", ["high", "low"])
+def test_weights_that_are_not_finite_are_refused(level: str) -> None:
+    model, _ = make("reached")
+    with th.no_grad():
+        next(getattr(model, level).policy.average_actor.parameters())[...] = np.nan
+    with pytest.raises(ConfigError, match="weights that are NaN or infinite"):
+        extract(model)
 
 
 def test_an_agent_with_windows_from_another_network_is_refused() -> None:
