@@ -13,6 +13,7 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.evaluate import identify
+from sb3_tbc.export.policy import extract
 from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.interpret.drawing import picture_of
 from sb3_tbc.interpret.episodes import HeldOutEpisodes
@@ -73,6 +74,8 @@ def command(argv: Sequence[str]) -> int:
     if not isinstance(units, CircuitUnits) and (args.synapses or args.wiring):
         asked = "--synapses" if args.synapses else "--wiring"
         raise ConfigError(f"{asked} is about the synapses of a circuit; this agent's low level is an MLP")
+    if args.html is not None:
+        _try_numbers(model)
     episodes = HeldOutEpisodes(model, info["env_id"], info["env_kwargs"], args.n_episodes, args.seed)
     try:
         effort = Effort(args.n_random, args.max_alone, args.synapses)
@@ -82,6 +85,17 @@ def command(argv: Sequence[str]) -> int:
     finally:
         episodes.close()
     return 0
+
+
+def _try_numbers(model: TBCHRL) -> None:
+    """Say before the episodes, which take minutes, that an agent can have no page.
+
+    :raises ConfigError: if so
+    """
+    try:
+        extract(model)
+    except ConfigError as error:
+        raise ConfigError(f"--html: the page computes both levels from an export, but {error}") from error
 
 
 def _space_of(model: TBCHRL, info: Plain) -> TaskSpace:

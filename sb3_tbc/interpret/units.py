@@ -57,13 +57,15 @@ def units_of(model: TBCHRL) -> Units:
     """The units of an agent's deployed (averaged) low level.
 
     :param model: a trained agent
-    :raises ConfigError: for an agent whose low level is a GRU
+    :raises ConfigError: for an agent whose low level is a GRU, or an MLP without hidden layers
     """
     actor = model.low.policy.average_actor
     if isinstance(actor, NDBCActor):
         return CircuitUnits(actor)
     if not isinstance(actor, MLPActor):
         raise ConfigError("only circuits and MLPs can be interpreted; this agent's low level is a GRU")
+    if len(actor.latent_pi) == 0:
+        raise ConfigError("this agent's low level is an MLP without hidden layers: it has no units to interpret")
     return MLPUnits(actor)
 
 

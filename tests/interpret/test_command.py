@@ -111,6 +111,25 @@ def test_mistakes_are_one_line(argument: str, words: str, capsys: pytest.Capture
     assert error.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"low": {"policy_kwargs": {"net_arch": [], "ndbc": None}}}, "without hidden layers: it has no units"),
+        ({"window_end": "reconsider"}, "from an export, but an agent with window_end"),
+        ({"duration": "rule"}, "from an export, but an agent with duration="),
+    ],
+)
+def test_agents_without_units_or_page_are_refused_before_the_episodes(
+    settings: dict[str, object], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = saved(tmp_path, **settings)
+    assert interpret.main([str(path), *SHORT, "--html", str(tmp_path / "p.html")]) == 2
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
+    assert said.out == ""
+
+
 @pytest.mark.parametrize("name", pretrained_names())
 def test_every_agent_of_the_package_has_a_card_that_is_true(name: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = pretrained_path(name)

@@ -49,6 +49,15 @@ def opened(browser: Any, path: Path, **view: Any) -> Any:
     return page
 
 
+def half_a_step_too_long() -> TBCHRL:
+    """Time budgets are 12.5 steps, which are rounded to the even number."""
+    model = untrained(whole_budgets=True, dt_max=12.5, high={"policy_kwargs": {"mean_bound": None}})
+    with th.no_grad():
+        model.high.policy.average_actor.mu.bias[-1] += 100.0
+    model.high.refresh()
+    return model
+
+
 def untrained(**settings: Any) -> TBCHRL:
     th.manual_seed(1)
     env = make_envs("sb3_tbc/Pendulum-v0", 1, 0, {})
@@ -68,6 +77,7 @@ AGENTS = {
         memory="window",
         low={"policy_kwargs": {"ndbc": {**CIRCUIT, "synapses": "lean", "sensory_to": ["inter", "command"]}}},
     ),
+    "whole": half_a_step_too_long,
     "MLP": lambda: untrained(low={"policy_kwargs": {"net_arch": [8, 8], "ndbc": None}}),
 }
 

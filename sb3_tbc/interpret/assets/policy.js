@@ -3,6 +3,12 @@
 
 const single = (values) => Array.from(values, Math.fround);
 
+/** The nearest whole number, of two the even one, as NumPy rounds; Math.round takes the larger one. */
+function toWhole(x) {
+  const rounded = Math.round(x);
+  return rounded - x === 0.5 && rounded % 2 !== 0 ? rounded - 1 : rounded;
+}
+
 class TwoLevels {
   constructor(policy) {
     this.p = policy;
@@ -51,7 +57,7 @@ class TwoLevels {
     const span = (low, high, u) => low + 0.5 * (u + 1) * (high - low);
     this.subgoal = this.p.subgoal_low.map((low, i) => span(low, this.p.subgoal_high[i], unit[i]));
     const steps = span(this.p.dt_min, this.p.dt_max, unit[n]);
-    this.budget = this.p.fixed_budget ?? (this.p.whole_budgets ? Math.max(Math.round(steps), 1) : steps);
+    this.budget = this.p.fixed_budget ?? (this.p.whole_budgets ? Math.max(toWhole(steps), 1) : steps);
     this.elapsed = 0;
     this.used += 1;
   }
