@@ -17,8 +17,9 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json, read_text, read_yaml
 from sb3_tbc.report.checked import check_final, check_place, check_sections, check_steps
+from sb3_tbc.settings import merge
 from sb3_tbc.zoo.callbacks import EvaluationRow
-from sb3_tbc.zoo.config import OF_PAPER, merge
+from sb3_tbc.zoo.config import OF_PAPER
 from sb3_tbc.zoo.ledger import COMMAND, RESUMED, VERSIONS, RunFolder, finished_runs, run_folders
 from sb3_tbc.zoo.schema import CONFIG_CLASSES
 

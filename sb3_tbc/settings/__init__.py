@@ -10,7 +10,7 @@ and unions of these; numbers have to be finite. This folder knows no particular 
 """
 
 from sb3_tbc.settings.domains import Domain, Increasing, NotEmpty, Prefixed, Range
-from sb3_tbc.settings.fields import SettingError, Settings, flat, plain, read, read_partial
+from sb3_tbc.settings.fields import SettingError, Settings, flat, merge, plain, read, read_partial
 from sb3_tbc.settings.kinds import default_of, hints, section_of, split
 from sb3_tbc.settings.listing import Entry, entries
 from sb3_tbc.settings.texts import describe
@@ -29,6 +29,7 @@ __all__ = [
     "entries",
     "flat",
     "hints",
+    "merge",
     "plain",
     "read",
     "read_partial",

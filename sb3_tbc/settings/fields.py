@@ -81,6 +81,15 @@ def plain(value: object) -> Any:
     return value
 
 
+def merge(base: PlainMapping, change: PlainMapping) -> Plain:
+    """``base`` updated with ``change``, section by section; a ``None`` replaces a whole section."""
+    result = dict(base)
+    for key, value in change.items():
+        old = result.get(key)
+        result[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return result
+
+
 def flat(settings: Mapping[str, object], prefix: str = "") -> dict[str, object]:
     """Plain data of all sections under dotted names."""
     found: dict[str, object] = {}

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Mapping
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.settings import SettingError, Settings, hints, section_of
+from sb3_tbc.settings import SettingError, Settings, hints, merge, section_of
 
 FORMER_NAMES = {"high_settings": "high", "low_settings": "low"}
 """Attributes of version 0.1.0 and the sections that they have become."""
@@ -88,7 +88,8 @@ def check_top_names(given: PlainMapping) -> None:
 def take_settings(attributes: Plain, config_class: type[Settings]) -> Plain:
     """Settings found among an agent's attributes, which are removed there.
 
-    :param attributes: ``settings`` as :meth:`to_dict` gave them, and single ones by name, which replace them
+    :param attributes: ``settings`` as :meth:`to_dict` gave them, and single ones by name, which replace them; of
+        sections, those within replace their counterparts and the others stay
     :param config_class: the agent's settings
     :raises SettingError: if a setting of a level stands among the agent's
     """
@@ -105,7 +106,7 @@ def take_settings(attributes: Plain, config_class: type[Settings]) -> Plain:
         if section_of(hint) is None:
             settings[name] = attributes.pop(name)
         elif isinstance(value, Mapping):  # else it is the level itself
-            settings[name] = {**settings.get(name, {}), **attributes.pop(name)}
+            settings[name] = merge(settings.get(name, {}), attributes.pop(name))
     _drop_retired(settings, attributes)
     return settings
 

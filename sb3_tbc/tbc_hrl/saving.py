@@ -132,7 +132,8 @@ class PlainAlgorithm(BaseAlgorithm):
     ) -> SelfPlain:
         """Load an agent, see SB3, without running any code from the file.
 
-        Settings given here replace those that it was saved with. A temperature with another ``ent_coef`` begins anew.
+        Settings given here replace those that it was saved with, section by section: what a section does not name stays.
+        A temperature with another ``ent_coef`` begins anew.
 
         :param path: the agent's ``.zip``, or an open file
         :param env: an environment to learn in; to act the agent needs none

@@ -19,12 +19,13 @@ from sb3_tbc.commands import INTERRUPTED, Parser, Several, positive_int, python,
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.outside import flat_name, folder_name
+from sb3_tbc.settings import merge
 from sb3_tbc.stopping import stop_request
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tune.objectives import ACROSS, OBJECTIVES
 from sb3_tbc.tune.search_space import complete, load_space, restrict
 from sb3_tbc.zoo.algorithms import algorithm, build_model
-from sb3_tbc.zoo.config import CONFIGS, RunConfig, config_file, load_config, merge, parse_overrides, read_file
+from sb3_tbc.zoo.config import CONFIGS, RunConfig, config_file, load_config, parse_overrides, read_file
 from sb3_tbc.zoo.environments import make_envs, resolve_env
 
 if TYPE_CHECKING:

@@ -18,9 +18,10 @@ from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.reading import settings_yaml
+from sb3_tbc.settings import merge
 from sb3_tbc.tune.pruning import SEED_VALUES
 from sb3_tbc.tune.study import ORIGIN, REASON, WORKER, StudySettings
-from sb3_tbc.zoo.config import RunConfig, merge
+from sb3_tbc.zoo.config import RunConfig
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

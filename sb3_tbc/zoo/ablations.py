@@ -13,9 +13,10 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.ndbc.diagnostics import mlp_parameters
+from sb3_tbc.settings import merge
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.zoo.algorithms import build_model
-from sb3_tbc.zoo.config import RunConfig, merge
+from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.environments import make_envs
 
 TOLERANCE = 0.005

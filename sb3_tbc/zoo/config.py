@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -11,6 +11,7 @@ from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import MAX_DEPTH, SettingsLoader, parse_yaml, read_yaml
+from sb3_tbc.settings import merge
 from sb3_tbc.tbc_hrl.config import TBCConfig
 from sb3_tbc.zoo.schema import RUN, validate
 
@@ -100,15 +101,6 @@ class RunConfig:
 def default_eval_freq(n_timesteps: int) -> int:
     """Environment steps between two evaluations of a run of ``n_timesteps``, where nothing else is said."""
     return max(n_timesteps // 40, 500)
-
-
-def merge(base: PlainMapping, change: PlainMapping) -> Plain:
-    """``base`` updated with ``change``, section by section; a ``None`` replaces a whole section."""
-    result = dict(base)
-    for key, value in change.items():
-        old = result.get(key)
-        result[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
-    return result
 
 
 def nested(settings: PlainMapping) -> Plain:

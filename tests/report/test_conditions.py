@@ -13,7 +13,8 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.report import tables
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.runs import load_results
-from sb3_tbc.zoo.config import load_config, merge
+from sb3_tbc.settings import merge
+from sb3_tbc.zoo.config import load_config
 
 
 def test_unequal_conditions_are_named(tmp_path: Path) -> None:

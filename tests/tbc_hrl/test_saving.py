@@ -109,6 +109,18 @@ def test_another_scale_of_inputs_is_refused(taught: TBCHRL) -> None:
         TBCHRL.load(saved(taught), low=low)  # type: ignore[arg-type]
 
 
+def test_what_is_not_named_within_a_section_stays() -> None:
+    """As in configuration files; the bound of means, which no weight shows, fell back to the default in silence."""
+    kwargs: Any = {**LEVEL["policy_kwargs"], "mean_bound": 2.0, "ndbc": {"seed": 3}}
+    model = TBCHRL("MultiInputPolicy", Corridor(20), low={**LEVEL, "policy_kwargs": kwargs})
+    changes: Any = {"policy_kwargs": {"log_std_bounds": (-4.0, 1.0), "ndbc": {"sub_steps": 5}}}
+    loaded = TBCHRL.load(saved(model), low=changes)
+    settings = loaded.config.low.policy_kwargs
+    assert (settings.mean_bound, settings.log_std_bounds, settings.net_arch) == (2.0, (-4.0, 1.0), (8,))
+    assert (settings.ndbc.seed, settings.ndbc.sub_steps) == (3, 5)  # type: ignore[union-attr]
+    assert loaded.low.policy.actor.net.sub_steps == 5  # type: ignore[union-attr]
+
+
 def test_a_level_may_be_given_as_settings_and_neutral_arguments_of_sb3_pass(taught: TBCHRL) -> None:
     low = LowConfig(batch_size=4, buffer_size=300, policy_kwargs=LEVEL["policy_kwargs"])
     model = TBCHRL.load(saved(taught), env=Corridor(20), low=low, use_sde=False)  # type: ignore[arg-type]

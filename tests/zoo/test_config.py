@@ -13,8 +13,9 @@ from sb3_tbc import TBCHRL
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.report.conditions import condition_values, differences
 from sb3_tbc.report.runs import Run
+from sb3_tbc.settings import merge
 from sb3_tbc.zoo.algorithms import build_model
-from sb3_tbc.zoo.config import RunConfig, config_file, load_config, merge, parse_overrides, read_file
+from sb3_tbc.zoo.config import RunConfig, config_file, load_config, parse_overrides, read_file
 from sb3_tbc.zoo.environments import make_envs, task_names
 
 TABLES = yaml.safe_load((Path(__file__).parents[1] / "data" / "paper_tables.yaml").read_text())

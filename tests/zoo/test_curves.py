@@ -12,8 +12,9 @@ import pytest
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.results_plotter import plot_results, ts2xy
 
+from sb3_tbc.settings import merge
 from sb3_tbc.tbc_hrl.evaluation import EvaluationResult
-from sb3_tbc.zoo.config import load_config, merge
+from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.curves import EVALUATION_EPISODES, MONITOR, EvaluationEpisodes, TrainingMonitor
 from sb3_tbc.zoo.ledger import RunFolder
 from sb3_tbc.zoo.runner import RunOptions, RunSpec, resume_run, start_run
