@@ -132,7 +132,7 @@ class PlainAlgorithm(BaseAlgorithm):
     ) -> SelfPlain:
         """Load an agent, see SB3, without running any code from the file.
 
-        Settings given here replace those that it was saved with, section by section: what a section does not name stays.
+        Settings given here replace those that it was saved with; what a section, as ``low``, does not name stays so.
         A temperature with another ``ent_coef`` begins anew.
 
         :param path: the agent's ``.zip``, or an open file
