@@ -42,7 +42,9 @@ class NDBCNet(nn.Module):
     :param dynamics: ``"conductance"`` or ``"dissipative"`` (equations 20 and 21)
     :param input_scale: fixed scales the inputs are divided by, ``(n_inputs,)``; by default 1
     :param readout: ``"all"`` sums over all neurons, as the paper's equation does, ``"motor"`` over the motor neurons
-    :param max_rho: dissipative only: keep the contraction factor of the certificate below this, during training too
+    :param max_rho: dissipative only: keep the contraction factor of the certificate, which is that of one sub-step, at
+        or below this, during training too. Short steps (many sub-steps, short intervals) leave recurrent synapses less
+        room, down to none
     :param adaptive_step: choose K by the step-size rule: True, or the fields of :class:`StepRule` that differ from
         their defaults; K then changes only in :meth:`after_update` and :meth:`refresh_step`, never inside a call
     :param seed: seed of the initial values; by default torch's global stream
@@ -95,7 +97,6 @@ class NDBCNet(nn.Module):
         else:
             kind = LeanCell if synapses == "lean" else ConductanceCell
             self.cell = kind(wiring, generator, time_constants=time_constants, initial_gains=initial_gains)
-        self._check_enforceable(max_rho)
         self.read_from = wiring.layer("motor").start if readout == "motor" else 0
         n_read = wiring.n_neurons - self.read_from
         drawn = 2.0 * th.rand(n_outputs, n_read, generator=generator) - 1.0
@@ -107,6 +108,7 @@ class NDBCNet(nn.Module):
         self.step_rule = (
             None if adaptive_step is False else StepRule(**({} if adaptive_step is True else adaptive_step))
         )
+        self._check_enforceable(max_rho)
         self.updates = 0
         self.refresh_step()
         self._centre(generator)
@@ -114,11 +116,13 @@ class NDBCNet(nn.Module):
     def _check_enforceable(self, max_rho: float | None) -> None:
         if max_rho is None or not isinstance(self.cell, DissipativeCell):
             return
-        least = 1.0 / (1.0 + self.cell.min_damping / self.sub_steps)
-        if max_rho <= least:
+        most = self.sub_steps if self.step_rule is None else self.step_rule.max_sub_steps
+        least = 1.0 / (1.0 + self.cell.min_damping / most)
+        if max_rho <= least:  # synapses that are silent once get no gradient, and stay so
+            count = f"{most} sub-steps" if self.step_rule is None else f"adaptive_step, up to {most} sub-steps,"
             raise ValueError(
-                f"max_rho={max_rho} leaves no room for recurrent synapses: with {self.sub_steps} sub-steps and damping "
-                f"at least {self.cell.min_damping} it must exceed {least:.3f}; use fewer sub-steps or a larger value"
+                f"max_rho={max_rho} leaves no room for recurrent synapses: with {count} and damping at least "
+                f"{self.cell.min_damping} it must exceed {least:.3f}; use fewer sub-steps or a larger value"
             )
 
     @th.no_grad()

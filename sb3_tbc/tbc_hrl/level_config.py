@@ -134,7 +134,7 @@ class CircuitConfig(Settings):
     """Neurons that actions are read from. ``all``: all of them, as in the paper's equation. ``motor``: the motor
     neurons."""
     max_rho: Annotated[float, Range(0, 1, above=True)] | None = None
-    """Largest contraction factor of the dissipative cell, enforced during training; null: no limit."""
+    """Largest contraction factor of a sub-step of the dissipative cell, enforced during training; null: no limit."""
     adaptive_step: bool | StepRule = False
     """Choose the number of sub-steps by the step-size rule (equation 17): true, or a section with its settings."""
 

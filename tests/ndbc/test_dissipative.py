@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch as th
@@ -60,6 +62,24 @@ def test_a_limit_of_rho_holds_for_each_length_of_step(rule: dict[str, object]) -
     together = net(inputs, state, interval=lengths)[1]
     alone = [net(inputs[i : i + 1], state[i : i + 1], interval=lengths[i : i + 1])[1] for i in range(4)]
     th.testing.assert_close(together, th.cat(alone), rtol=0.0, atol=1e-6)
+
+
+def test_a_limit_of_rho_leaves_room_with_the_most_sub_steps_that_adaptive_step_may_take() -> None:
+    """Silent synapses get no gradient; they were so for good where K grew from 3, which leaves room, to 6."""
+    with pytest.raises(ValueError, match=r"with adaptive_step, up to 6 sub-steps, .* it must exceed 0\.923"):
+        random_net(0, dynamics="dissipative", max_rho=0.9, adaptive_step=True)
+    random_net(0, dynamics="dissipative", max_rho=0.9, adaptive_step={"delta_min": 1 / 3})
+    net = random_net(0, 3.0, dynamics="dissipative", max_rho=0.93, adaptive_step=True)
+    cell: Any = net.cell
+    with th.no_grad():
+        cell.raw_damping.fill_(-20.0)  # the smallest damping there is
+        cell.raw_weight.fill_(10.0)
+    net.refresh_step()
+    arrays = cell.arrays()
+    assert net.sub_steps == 6
+    assert float(cell.enforced(arrays, cell.step_terms(arrays, 1 / 6)).abs().max()) > 0.0
+    net(th.ones(1, 4, 3))[0].sum().backward()
+    assert float(cell.raw_damping.grad.abs().sum()) > 0.0
 
 
 @pytest.mark.parametrize("sub_steps", [1, 3])
