@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import Protocol, cast
+from typing import NoReturn, Protocol, cast
 
 import numpy as np
 import torch as th
@@ -148,6 +148,17 @@ class SACLevel(SAC):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_update", "acting"]
+
+    @classmethod
+    def load(cls, *_: object, **__: object) -> NoReturn:
+        """Refused: SB3's would unpickle what the file holds, and then know no environment of a level.
+
+        :raises TypeError: always, naming what to load
+        """
+        raise TypeError(
+            "a level is loaded with its agent: use TBCHRL.load(path); weights of a level that was saved alone are read "
+            "by its set_parameters(path)"
+        )
 
     @property
     def compiled(self) -> bool:

@@ -3,6 +3,7 @@
 import copy
 import pickle
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from torch import nn
 
 from sb3_tbc.errors import HierarchyError, NonFiniteError
 from sb3_tbc.level.level import SACLevel
+from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.replay.batch import LevelBatch
 
 OBSERVATIONS = spaces.Box(-np.inf, np.inf, (6,), np.float32)
@@ -245,3 +247,18 @@ def test_act_is_fast(actor: dict) -> None:
         level.act(obs, states, False, rng)
         times.append(time.perf_counter() - start)
     assert np.median(times) < (60e-6 if not actor else 120e-6)
+
+
+def test_loading_a_level_alone_is_refused_before_anything_is_unpickled(tmp_path: Path) -> None:
+    class Payload:
+        def __reduce__(self) -> tuple[object, ...]:
+            return Path.touch, (tmp_path / "ran",)
+
+    level = SACLevel(LevelPolicy, OBSERVATIONS, ACTIONS, name="low", compile=False)
+    level.stranger = Payload()
+    level.save(tmp_path / "level.zip")
+    with pytest.raises(TypeError, match=r"a level is loaded with its agent: use TBCHRL\.load"):
+        SACLevel.load(tmp_path / "level.zip")
+    assert not (tmp_path / "ran").exists()
+    level.set_parameters(tmp_path / "level.zip")
+    assert not (tmp_path / "ran").exists()
