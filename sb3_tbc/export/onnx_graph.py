@@ -205,7 +205,8 @@ def _angle(g: _Graph, y: str, x: str) -> str:
     below = g("Where", steep, y, x)
     below = g("Where", g("Equal", below, zero), tiny, below)
     ratio = g("Atan", g("Div", g("Where", steep, x, y), below))
-    side = g("Where", g("Less", y, zero), g.constant(-1.0), one)
+    negative = g("Or", g("Less", y, zero), g("Less", g("Div", one, y), zero))  # -0.0, too, whose inverse is -inf
+    side = g("Where", negative, g.constant(-1.0), one)
     flat = g("Add", ratio, g("Where", g("Less", x, zero), g("Mul", side, g.constant(np.pi)), zero))
     return g("Where", steep, g("Sub", g("Mul", side, g.constant(np.pi / 2)), ratio), flat)
 
