@@ -116,7 +116,7 @@ def test_mistakes_are_one_line(argument: str, words: str, capsys: pytest.Capture
     [
         ({"low": {"policy_kwargs": {"net_arch": [], "ndbc": None}}}, "without hidden layers: it has no units"),
         ({"window_end": "reconsider"}, "from an export, but an agent with window_end"),
-        ({"duration": "rule"}, "from an export, but an agent with duration="),
+        ({"duration": "rule"}, "from an export, but duration="),
     ],
 )
 def test_agents_without_units_or_page_are_refused_before_the_episodes(
