@@ -15,7 +15,7 @@ from stable_baselines3.common.save_util import recursive_getattr, recursive_seta
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.errors import nearest
+from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.files import save_atomic
 from sb3_tbc.settings import SettingError, Settings, hints, plain
 from sb3_tbc.smdp.episode_limit import with_episode_limit
@@ -119,6 +119,21 @@ class PlainAlgorithm(BaseAlgorithm):
         return changes
 
     @classmethod
+    def _check_policy(cls, policy: object, name: str) -> None:
+        """Refuse an agent of another algorithm, whose policy this one cannot hold.
+
+        :param policy: the class of the saved policy; anything else if it is not known before it is unpickled
+        :param name: of the file
+        :raises ConfigError: if it is no policy of this algorithm
+        """
+        own = tuple(cls.policy_aliases.values())
+        if isinstance(policy, type) and not issubclass(policy, own):
+            raise ConfigError(
+                f"{name} holds an agent whose policy is a {policy.__name__}, where {cls.__name__} has a "
+                f"{own[0].__name__}: load it with the class that saved it"
+            )
+
+    @classmethod
     def load(
         cls: type[SelfPlain],
         path: str | pathlib.Path | io.BufferedIOBase,
@@ -141,16 +156,17 @@ class PlainAlgorithm(BaseAlgorithm):
             0.1.0, policy classes and subgoal functions of your own. Use it only for files whose origin you trust:
             unpickling can run any code.
         :raises UntrustedError: if the file holds something that must be unpickled, unless ``trust`` is given
-        :raises ConfigError: if the file is damaged or no agent
+        :raises ConfigError: if the file is damaged, or no agent of this class
         :raises SettingError: on an unknown setting, a value that it cannot have, or one that the weights do not fit
         """
         device = device_here(device)
         name = str(path) if isinstance(path, str | pathlib.Path) else "the agent"
         content = read_bytes(path)
         data, given = read_data(content, name), dict(custom_objects or {})
+        values = {} if trust else unpickled(data, name, given, env is not None)
+        cls._check_policy({**values, **given}.get("policy_class"), name)
         changes = cls._changes(kwargs, data)
         now, later = parted(changes)
-        values = {} if trust else unpickled(data, name, given, env is not None)
         try:
             model = super().load(
                 io.BytesIO(content), env, device, {**values, **given}, print_system_info, force_reset, **now

@@ -10,9 +10,12 @@ import pytest
 import torch as th
 from corridor import Corridor
 
-from sb3_tbc import TBCHRL
+from sb3_tbc import NDBCSAC, TBCHRL
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.settings import SettingError
 from sb3_tbc.tbc_hrl.config import LowConfig
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
 LEVEL: dict[str, Any] = {"batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}}
 
@@ -22,7 +25,7 @@ def agent(**settings: Any) -> TBCHRL:
     return TBCHRL("MultiInputPolicy", Corridor(20), **{**given, **settings})
 
 
-def saved(model: TBCHRL) -> io.BytesIO:
+def saved(model: PlainAlgorithm) -> io.BytesIO:
     file = io.BytesIO()
     model.save(file)  # type: ignore[arg-type]
     return file
@@ -127,3 +130,19 @@ def test_a_level_may_be_given_as_settings_and_neutral_arguments_of_sb3_pass(taug
     assert (model.config.low.batch_size, model.config.low.buffer_size) == (4, 300)
     with pytest.raises(SettingError, match="use_sde is not taken"):
         TBCHRL.load(saved(taught), use_sde=True)  # type: ignore[arg-type]
+
+
+def test_an_agent_of_another_algorithm_is_refused_by_its_policy(taught: TBCHRL) -> None:
+    files: list[tuple[type[PlainAlgorithm], io.BytesIO]] = [
+        (TBCHRL, saved(taught)),
+        (FlatSAC, saved(FlatSAC("MultiInputPolicy", Corridor(20), buffer_size=500))),
+        (NDBCSAC, saved(NDBCSAC("MultiInputPolicy", Corridor(20), buffer_size=500))),
+    ]
+    for algorithm, _ in files:
+        for saver, file in files:
+            file.seek(0)
+            if algorithm is saver:
+                assert isinstance(algorithm.load(file), algorithm)  # type: ignore[arg-type]  # SB3 names no open files
+                continue
+            with pytest.raises(ConfigError, match=f"{algorithm.__name__} has a .*: load it with the class"):
+                algorithm.load(file)  # type: ignore[arg-type]
