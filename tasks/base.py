@@ -172,13 +172,15 @@ class GoalTask(GoalEnv):  # type: ignore[misc]
         """Start an episode.
 
         :param seed: seeds the task's own random generator
-        :param options: ``goal`` (desired goal) and ``state`` (dictionary of arrays); what is absent is drawn
+        :param options: ``goal`` (desired goal) and ``state`` (dictionary of arrays); what is absent is drawn, as it
+            would be without options
         :raises ValueError: for unknown keys, wrong shapes and values that are not finite
         :raises TypeError: for options, or a state in them, that are no dictionary
         """
         super().reset(seed=seed)
         goal, state = self._read_options(options or {})
-        self._goal = np.array(self._sample_goal() if goal is None else goal, dtype=np.float64)
+        drawn = self._sample_goal()  # even where one is given, so that what follows from the seed stays the same
+        self._goal = np.array(drawn if goal is None else goal, dtype=np.float64)
         self._goal_list = self._goal.tolist()
         self._overlay = Overlay()
         self._elapsed = 0

@@ -27,7 +27,8 @@ class Perturb(Wrapper):
     :param env: one of our tasks
     :param observation_noise: standard deviation of Gaussian noise on each entry of ``observation``, in units of the
         task's ``observation_scale``; a frame keeps its noise while it stays in a stacked observation
-    :param action_delay: steps before an action takes effect; until the first arrives, the action is zero
+    :param action_delay: steps before an action takes effect, fewer than an episode of the task has; until the first
+        arrives, the action is zero
     :param dynamics_scale: factors on physical quantities, e.g. ``{"mass": 1.2, "friction": [0.5, 1.5]}``; a pair is a
         range from which each episode draws. Every task lists its names in ``dynamics_names``
     :param goal_switch: probability per step that the desired goal is drawn anew before the step
@@ -51,8 +52,12 @@ class Perturb(Wrapper):
         self._task: GoalTask = env
         self._noise = _number("observation_noise", observation_noise, 0.0, np.inf)
         self._switch = _number("goal_switch", goal_switch, 0.0, 1.0)
-        if not isinstance(action_delay, Integral) or isinstance(action_delay, bool) or action_delay < 0:
-            raise ValueError(f"action_delay must be a whole number of steps, at least 0, got {action_delay!r}")
+        longest = env.max_episode_steps - 1
+        if not isinstance(action_delay, Integral) or isinstance(action_delay, bool) or not 0 <= action_delay <= longest:
+            raise ValueError(
+                f"action_delay must be a whole number of steps from 0 to {longest}, the episode's length less one (a "
+                f"longer delay lets no action take effect), got {action_delay!r}"
+            )
         self._delay: int = int(action_delay)
         if not isinstance(dynamics_scale or {}, Mapping):
             raise TypeError(

@@ -104,7 +104,8 @@ class Tennis2D(ReplayedTask):
         return [6.0, height, 0.0, -speed * math.cos(direction), speed * math.sin(direction), spin]
 
     def _restart(self, state: dict[str, Array]) -> None:
-        shot = state["ball_shot"].tolist() if "ball_shot" in state else self._sample_shot()
+        drawn = self._sample_shot()  # even where one is given, so that later episodes of the seed stay the same
+        shot = state["ball_shot"].tolist() if "ball_shot" in state else drawn
         if not self.legacy_quirks:
             self._new_world()
         self._start(shot)

@@ -115,6 +115,7 @@ def test_goals_switch_consistently():
         ("Pendulum", {"observation_noise": -1.0}, "observation_noise"),
         ("Pendulum", {"observation_noise": np.nan}, "observation_noise"),
         ("Pendulum", {"action_delay": 1.5}, "whole number"),
+        ("Pendulum", {"action_delay": 1000}, "from 0 to 999, .* got 1000"),
         ("Pendulum", {"goal_switch": 2.0}, "goal_switch"),
         ("Pendulum", {"dynamics_scale": {"colour": 1.0}}, "mass"),
         ("Pendulum", {"dynamics_scale": {"mass": [2.0, 1.0]}}, "range"),

@@ -198,6 +198,18 @@ def test_seeds_differ(task):
 
 
 @all_ids
+def test_given_goals_and_states_leave_the_rest_of_a_seed_as_it_is(task):
+    env = make(task)
+    given = {"Tennis2D": {"ball_shot": [6.0, 1.2, 0.0, -5.0, 0.1, 0.0]}}
+    first, later = env.reset(seed=5)[0], [env.reset()[0] for _ in range(2)]
+    started = env.reset(seed=5, options={"goal": first["desired_goal"]})[0]
+    assert equal(started, first)
+    for options in ({"goal": first["desired_goal"]}, {"state": given.get(task, {})}):
+        env.reset(seed=5, options=options)
+        assert all(equal(env.reset()[0], one) for one in later)
+
+
+@all_ids
 def test_observations_are_not_aliased(task):
     env = make(task)
     trace, _ = rollout(env, random_actions(env, 5), seed=0)
