@@ -173,9 +173,9 @@ class TBCHRL(TwoLevelSaving):
         self.config = self.config_class.from_dict(take_settings(self.__dict__, self.config_class))
         self.settings = self.config.to_dict()
         self.set_random_seed(self.seed)
-        space, actions = check_goal_space(self.observation_space), self.action_space
-        if not isinstance(actions, spaces.Box) or len(actions.shape) != 1:
-            raise ValueError(f"{type(self).__name__} needs a Box action space with one dimension, got {actions}")
+        actions = self.action_space
+        space = check_goal_space(self.observation_space, actions)
+        assert isinstance(actions, spaces.Box)  # checked
         if self.env is not None:
             self._read_environment(self.env)
         if self.subgoals is None:

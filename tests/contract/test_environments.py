@@ -190,7 +190,7 @@ def test_a_reward_says_enough(algo: str) -> None:
     assert make(algo, gym.wrappers.TimeLimit(GoalsOutside(NoGoals()), 20)).learn(60).num_timesteps == 60
 
 
-@shows("refused", "environments without goals, discrete or two-dimensional actions")
+@shows("refused", "environments without goals, discrete, whole-number or two-dimensional actions")
 @every_algorithm
 def test_what_is_no_goal_environment(algo: str) -> None:
     class Discrete(Corridor):
@@ -203,7 +203,13 @@ def test_what_is_no_goal_environment(algo: str) -> None:
             super().__init__(20)
             self.action_space = spaces.Box(-1, 1, (2, 2), np.float32)
 
-    for env, words in ((NoGoals(), "must be a Dict"), (Discrete(), "Box"), (Square(), "one dimension")):
+    class Whole(Corridor):
+        def __init__(self) -> None:
+            super().__init__(20)
+            self.action_space = spaces.Box(-1, 1, (1,), np.int64)
+
+    refused = (NoGoals(), "must be a Dict"), (Discrete(), "Box"), (Square(), "one dimension"), (Whole(), "real numbers")
+    for env, words in refused:
         with pytest.raises((ValueError, AssertionError), match=words):
             make(algo, env)
 
