@@ -248,7 +248,7 @@ class SACLevel(SAC):
                 break
         return (
             f"{self.log_prefix[:-1]}.{name} became NaN or infinite within the burst that ended at update"
-            f" {self._n_updates}; a lower learning rate or rewards of smaller scale usually cure it"
+            f" {self._n_updates}; a lower learning rate, or observations or rewards of smaller scale, usually cure it"
         )
 
     @property

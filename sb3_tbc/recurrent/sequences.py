@@ -152,9 +152,10 @@ class SequenceReplayBuffer(ReplayBuffer):
 
     def _drawn(self, n: int) -> tuple[AnyArray, AnyArray]:
         """Rows ``(n, time)`` and environments ``(n, 1)`` of sequences that do not run across the newest row."""
-        length = min(self.sequence_length, self.size())
-        # of a full ring's oldest row, the action before it is overwritten
-        first = np.random.randint(int(self.full), self.size() - length + 1, size=(n, 1))  # noqa: NPY002, as SB3 draws
+        # the action before the oldest row of a ring is gone, also where it was loaded into a larger one
+        left_out = int(self.full or not self.starts[0].all())
+        length = min(self.sequence_length, self.size() - left_out)
+        first = np.random.randint(left_out, self.size() - length + 1, size=(n, 1))  # noqa: NPY002, as SB3 draws
         oldest = self.pos if self.full else 0
         envs = np.random.randint(0, self.n_envs, size=(n, 1))  # noqa: NPY002
         return (oldest + first + np.arange(length)) % self.buffer_size, envs

@@ -21,7 +21,7 @@ from sb3_tbc.tbc_hrl.flat_sac import CYCLE, FlatSAC
 
 DIVERGED = 1e12
 """Critic loss at which training has diverged: values of about a million, while returns are 10 to 1000."""
-CURE = "a lower learning rate or rewards of smaller scale usually cure it"
+CURE = "a lower learning rate, or observations or rewards of smaller scale, usually cure it"
 
 
 class LossWatch(KVWriter):

@@ -181,6 +181,17 @@ def test_all_steps_are_drawn() -> None:
     assert set(times.unique().tolist()) == set(range(71, 100))  # of the oldest row, the action before it is lost
 
 
+def test_actions_before_are_known_in_a_larger_buffer_too(tmp_path: Path) -> None:
+    np.random.seed(0)  # noqa: NPY002
+    filled(47).save(tmp_path / "replay.npz")  # a full ring of steps 17 to 46
+    larger = filled(0, size=100)
+    larger.load(tmp_path / "replay.npz")
+    now: Any = larger.sample(500).observations
+    time = now.inputs[..., 0]
+    assert time.min() == 18  # the action of step 16 is gone
+    th.testing.assert_close(now.inputs[..., 1], th.where(now.starts, 0.0, (time - 1) / 1000))
+
+
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_collection_notes_starts_and_actions(n_envs: int) -> None:
     env = make_vec_env(Recall, n_envs)
