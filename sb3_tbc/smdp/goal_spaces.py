@@ -43,7 +43,10 @@ def _action_problems(action: Space) -> list[str]:
             "declare Box(..., dtype=numpy.float32), and round them in the environment's step"
         ]
     if not np.all(np.isfinite(action.low) & np.isfinite(action.high)):
-        return [f"its action bounds must be finite, got {action}; use gymnasium's RescaleAction or ClipAction"]
+        return [
+            f"its action bounds must be finite, got {action}: declare the largest actions that make sense; gymnasium's "
+            "ClipAction takes bounds away, leave it out, as an agent's actions never leave theirs"
+        ]
     return []
 
 

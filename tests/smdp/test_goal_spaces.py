@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from sb3_tbc.smdp.goal_spaces import UnitActions
+from sb3_tbc.smdp.goal_spaces import UnitActions, goal_space_problems
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
@@ -18,3 +18,13 @@ def test_actions_lie_in_their_space(dtype: type[np.floating]) -> None:
         actions = unit.unscale(np.full(1000, corner, dtype=np.float32))
         assert space.contains(actions)
         assert np.allclose(unit.scale(actions), corner, atol=1e-5)
+
+
+def test_actions_without_bounds_have_a_cure_that_works() -> None:
+    """RescaleAction refuses such spaces, and ClipAction is what makes them."""
+    goals = spaces.Dict({key: spaces.Box(-1, 1, (1,)) for key in ("observation", "achieved_goal", "desired_goal")})
+    given = spaces.Box(np.float32([-1, -np.inf]), np.float32([1, 1]))
+    (problem,) = goal_space_problems(goals, given)
+    assert problem.startswith("its action bounds must be finite")
+    assert "RescaleAction" not in problem
+    assert "ClipAction takes bounds away" in problem
