@@ -306,6 +306,25 @@ def test_what_to_type_next_names_this_python(tmp_path: Path, monkeypatch: pytest
     assert python() == "python"
 
 
+def test_flat_sac_without_a_time_limit(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It never learnt, its evaluation never ended, and no signal stopped it."""
+    import gymnasium as gym
+    from corridor import Corridor
+
+    class Endless(Corridor):
+        def __init__(self) -> None:
+            super().__init__()
+            self.max_episode_steps = None  # type: ignore[assignment]
+
+    if "EndlessGoal-v0" not in gym.registry:
+        gym.register("EndlessGoal-v0", Endless, disable_env_checker=True)
+    asked = ["--env", "EndlessGoal-v0", "--algo", "sac", "--n-timesteps", "100", "--log-folder", str(tmp_path)]
+    capsys.readouterr()  # a notice of Gymnasium-Robotics
+    assert train.main(asked) == 2
+    assert "have no time limit" in said(capsys)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_action_space_that_is_no_box(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     import gymnasium as gym
     from gymnasium import spaces

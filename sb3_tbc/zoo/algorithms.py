@@ -16,6 +16,7 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.tasks.foreign import ROBOTICS
 from sb3_tbc.tbc_hrl import HAC, TBCHRL, HiTS
 from sb3_tbc.tbc_hrl.archive import UntrustedError, read_bytes, read_data
+from sb3_tbc.tbc_hrl.environment import episode_length
 from sb3_tbc.tbc_hrl.evaluation import Agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.zoo.config import RunConfig
@@ -51,12 +52,18 @@ def build_model(run: RunConfig, env: VecEnv, seed: int, **options: Unpack[BuildO
     :param env: training environments
     :param seed: seed of the networks, of sampling and of the environments
     :param options: see :class:`BuildOptions`
-    :raises ConfigError: if the agent refuses a setting or the environment
+    :raises ConfigError: if the agent refuses a setting or the environment, or flat SAC is to learn without a time limit
     """
     settings = dict(run.model)
     policy = settings.pop("policy", "MultiInputPolicy")
+    kind = algorithm(run.algo)
+    if kind is FlatSAC and episode_length(env) is None:  # two levels end an episode when their decisions are used up
+        raise ConfigError(
+            f"{run.algo} on {run.task}: its episodes have no time limit, so that training and evaluations might wait "
+            "for their end for ever; give one: --hyperparams env_kwargs.max_episode_steps:N"
+        )
     try:
-        return algorithm(run.algo)(policy, env, seed=seed, **settings, **options)
+        return kind(policy, env, seed=seed, **settings, **options)
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{run.algo} on {run.task}: {error}") from error
     except (MemoryError, OverflowError) as error:
