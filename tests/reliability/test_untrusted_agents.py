@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from corridor import Corridor
+from gymnasium import spaces
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from stable_baselines3.common.save_util import load_from_zip_file
@@ -242,11 +243,18 @@ JSON = st.recursive(
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=8), inner, max_size=4),
     max_leaves=12,
 )
-KIND = st.sampled_from(["number", "array", "box", "spaces", "unit", "tuple", "deque", "slice", "schedule", "object"])
+PART = st.sampled_from(["low", "high", "items", "dtype", "shape", "values", "n", "start"])
+KIND = st.sampled_from(
+    ["number", "array", "box", "discrete", "binary", "spaces", "unit", "tuple", "deque", "slice", "schedule", "object"]
+)
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
-@given(JSON, KIND, st.dictionaries(st.sampled_from(["low", "high", "items", "dtype", "shape", "values"]), JSON))
+@given(
+    JSON,
+    KIND,
+    st.dictionaries(st.sampled_from(["low", "high", "items", "dtype", "shape", "values", "n", "start"]), JSON),
+)
 def test_any_plain_data_is_read_or_refused(value: Any, kind: str, parts: dict[str, Any]) -> None:
     for data in (value, {"plain": kind, **parts}):
         with contextlib.suppress(NotPlainError):
@@ -257,6 +265,21 @@ def test_any_plain_data_is_read_or_refused(value: Any, kind: str, parts: dict[st
 @given(JSON)
 def test_plain_data_comes_back_as_it_was(value: Any) -> None:
     assert repr(decode(json.loads(json.dumps(encode(value))))) == repr(value)
+
+
+@pytest.mark.parametrize(
+    "space",
+    [
+        spaces.Discrete(3, start=-1),
+        spaces.MultiBinary(4),
+        spaces.MultiBinary([2, 3]),
+        spaces.MultiDiscrete([2, 5], start=[1, 0]),
+        spaces.Dict({"z": spaces.Discrete(2), "a": spaces.Box(-1, 1, (2,))}),
+    ],
+    ids=str,
+)
+def test_spaces_come_back_as_they_were(space: spaces.Space[Any]) -> None:
+    assert decode(json.loads(json.dumps(encode(space)))) == space
 
 
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
