@@ -57,7 +57,7 @@ def test_check_names_every_problem():
     env = Point()
     env.action_space = spaces.Box(-np.inf, np.inf, (2,))
     env.observation_space["achieved_goal"] = spaces.Box(-1, 1, (3,))
-    with pytest.raises(ValueError, match=r"(?s)RescaleAction.*one shape"):
+    with pytest.raises(ValueError, match=r"(?s)declare the largest actions.*one shape"):
         check_goal_env(env)
 
 
