@@ -6,12 +6,27 @@ import re
 import zlib
 from collections.abc import Callable
 from importlib.resources import files
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.export.policy import MLP, Circuit, Coordinate, Dissipative, ExportedPolicy
+from sb3_tbc.export.rounding import whole
+
+Entries = tuple[NDArray[np.integer], NDArray[np.integer]]
+"""Which entries of a weight matrix are stored, in which order: their rows (inputs) and columns (outputs)."""
+
+
+class Storage(NamedTuple):
+    """How weight matrices are stored."""
+
+    write: Callable[
+        [str, FloatArray, Entries], str
+    ]  # an array of a name, and TBC_<NAME>_STEP(o), its unit for an output
+    c_type: str
+    size: int  # bytes of an entry, in single precision
 
 
 def to_c(policy: ExportedPolicy) -> str:
@@ -19,13 +34,13 @@ def to_c(policy: ExportedPolicy) -> str:
 
     :param policy: what to export
     """
-    data, code = _low_level(policy.low)
+    data, code = _low_level(policy.low, STORAGE[policy.weights])
     values = {
         "TASK": re.sub(r"[^A-Za-z0-9_.-]", "_", policy.task),
         "SIZES": _sizes(policy),
         "LOW_DATA": data,
         "LOW_CODE": code,
-        "HIGH_DATA": _mlp("high", policy.high) + _option_data(policy),
+        "HIGH_DATA": _mlp("high", policy.high, STORAGE["float32"]) + _option_data(policy),
         "ACHIEVED": "\n".join(_coordinate(i, c) for i, c in enumerate(policy.achieved)) or "    (void)entries;",
         "REACHED": _reached(policy),
         "EVENT": ""
@@ -57,13 +72,13 @@ def _template(name: str) -> str:
     return (files("sb3_tbc.export") / "templates" / name).read_text(encoding="utf-8")
 
 
-def _low_level(low: MLP | Circuit | Dissipative) -> tuple[str, str]:
+def _low_level(low: MLP | Circuit | Dissipative, storage: Storage) -> tuple[str, str]:
     """Data and code."""
     if isinstance(low, Circuit):
-        return _circuit(low), _circuit_code(low)
+        return _circuit(low, storage), _circuit_code(low)
     if isinstance(low, Dissipative):
-        return _dissipative(low), _template("dissipative.c")
-    return _mlp("low", low), _LOW_MLP
+        return _dissipative(low, storage), _template("dissipative.c")
+    return _mlp("low", low, storage), _LOW_MLP
 
 
 def _sizes(policy: ExportedPolicy) -> str:
@@ -90,10 +105,22 @@ def array(name: str, values: FloatArray, kind: str = "tbc_real") -> str:
     return f"static const {kind} {name}[{max(1, np.size(values))}] = {{{floats(values) or '0.0f'}}};\n"
 
 
-def exact(name: str, values: FloatArray) -> str:
-    """A constant array in double precision, for products that single precision would round."""
-    listed = ", ".join(f"(tbc_real){float(v)!r}" for v in np.asarray(values, np.float64).ravel())
-    return f"static const tbc_real {name}[{max(1, np.size(values))}] = {{{listed or '0.0f'}}};\n"
+def float_matrix(name: str, matrix: FloatArray, entries: Entries) -> str:
+    """Weights as they are."""
+    return array(name, matrix[entries]) + f"#define TBC_{name.upper()}_STEP(o) 1\n"
+
+
+def whole_matrix(name: str, matrix: FloatArray, entries: Entries) -> str:
+    """Weights as bytes; those that :mod:`~sb3_tbc.export.rounding` has rounded stay what they are."""
+    numbers, unit, halvings = whole(matrix)
+    listed = ", ".join(str(n) for n in numbers[entries]) or "0"
+    text = f"static const signed char {name}[{max(1, len(entries[0]))}] = {{{listed}}};\n"
+    text += _indices(f"{name}_halvings", halvings)
+    step = f"({floats(np.array(unit))} / (tbc_real)(1ul << {name}_halvings[o]))"
+    return f"{text}#define TBC_{name.upper()}_STEP(o) {step}\n"
+
+
+STORAGE = {"float32": Storage(float_matrix, "tbc_real", 4), "int8": Storage(whole_matrix, "signed char", 1)}
 
 
 def _indices(name: str, values: NDArray[np.integer]) -> str:
@@ -102,15 +129,29 @@ def _indices(name: str, values: NDArray[np.integer]) -> str:
     return f"static const {kind} {name}[{max(1, len(values))}] = {{{listed}}};\n"
 
 
-def _sparse(
-    name: str, matrix: FloatArray, columns: dict[str, FloatArray], write: Callable[[str, FloatArray], str] = array
-) -> str:
-    """Compressed rows by postsynaptic neuron: start of each row, presynaptic indices, one array per set of values."""
+def _sparse(name: str, matrix: FloatArray, columns: dict[str, FloatArray], storage: Storage) -> str:
+    """Compressed rows by postsynaptic neuron: where each begins, presynaptic indices, one array per set of values.
+
+    Where nearly everything is wired to everything, zeros take less room than indices.
+    """
     present = matrix.T != 0
-    post, pre = np.nonzero(present)
-    begin = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
-    text = _indices(f"{name}_begin", begin) + _indices(f"{name}_pre", pre)
-    return text + "".join(write(f"{name}_{column}", values[pre, post]) for column, values in columns.items())
+    macro, inputs = f"#define TBC_{name.upper()}", present.shape[1]
+    cell = storage.size * len(columns)
+    dense = present.mean() * (cell + 1) > cell  # an index takes one byte, seldom two
+    post, pre = np.nonzero(present | dense)
+    if dense:
+        text = f"{macro}_BEGIN(i) ((i) * {inputs})\n{macro}_PRE(i, k) ((k) - (i) * {inputs})\n"
+    else:
+        begin = np.concatenate([[0], np.cumsum(present.sum(axis=1))])
+        text = _indices(f"{name}_begin", begin) + _indices(f"{name}_pre", pre)
+        text += f"{macro}_BEGIN(i) {name}_begin[i]\n{macro}_PRE(i, k) {name}_pre[k]\n"
+    return text + "".join(storage.write(f"{name}_{column}", values, (pre, post)) for column, values in columns.items())
+
+
+def _full(name: str, matrix: FloatArray, storage: Storage) -> str:
+    """All entries, output after output."""
+    outputs, inputs = np.indices(matrix.T.shape)
+    return storage.write(name, matrix, (inputs.ravel(), outputs.ravel()))
 
 
 def _circuit_code(c: Circuit) -> str:
@@ -120,7 +161,7 @@ def _circuit_code(c: Circuit) -> str:
     return re.sub(rf"@(?:{kept}|END)@\n", "", text)
 
 
-def _circuit(c: Circuit) -> str:
+def _circuit(c: Circuit, storage: Storage) -> str:
     n, (inputs, driven), s = c.n_neurons, c.current_weight.shape, len(c.sensory_gain)
     sensory, currents = c.from_inputs[:s], c.from_inputs[s:]
     sizes = {} if c.lean else {"SENSORY": inputs}
@@ -129,29 +170,29 @@ def _circuit(c: Circuit) -> str:
     order = np.concatenate(c.order)
     turn = np.argsort(order)
     early = [j for j, heard in enumerate(c.recurrent[:, n:] != 0) if (turn[:n][heard] <= turn[j]).any()]
-    text += f"#define TBC_LOOPS {len(early)}\n" + _indices("heard_early", np.array(early, dtype=int))
-    text += _indices("relaxation_order", order)
-    input_gain = c.input_gain.astype(np.float64)
+    text += f"#ifndef TBC_INTEGRATED_ONLY\n#define TBC_LOOPS {len(early)}\n"
+    text += _indices("heard_early", np.array(early, dtype=int)) + _indices("relaxation_order", order) + "#endif\n"
+    text += array("input_gain", c.input_gain)
     if not c.lean:
-        text += exact("sensory_gain", c.sensory_gain * input_gain) + array("sensory_threshold", c.sensory_threshold)
+        text += array("sensory_gain", c.sensory_gain) + array("sensory_threshold", c.sensory_threshold)
     text += array("gain", c.gain) + array("threshold", c.threshold)
     text += array("rest_weighted", c.rest[:n]) + array("rest_total", c.rest[n:])
     text += array("capacitance", c.capacitance) + array("current_bias", c.current_bias)
     text += array("input_conductance", currents[np.arange(driven), np.arange(driven)])
-    text += _sparse("current", c.current_weight, {"weight": c.current_weight * input_gain[:, None]}, exact)
+    text += _sparse("current", c.current_weight, {"weight": c.current_weight}, storage)
     columns = {"weighted": c.recurrent[:, :n]}
     if not c.lean:
-        text += _sparse("sensory", sensory[:, n:], {"weighted": sensory[:, :n], "total": sensory[:, n:]})
+        text += _sparse("sensory", sensory[:, n:], {"weighted": sensory[:, :n], "total": sensory[:, n:]}, storage)
         columns["total"] = c.recurrent[:, n:]
-    text += _sparse("recurrent", c.recurrent[:, n:], columns)
-    return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
+    text += _sparse("recurrent", c.recurrent[:, n:], columns, storage)
+    return text + _full("readout", c.readout, storage) + array("readout_bias", c.readout_bias)
 
 
-def _dissipative(c: Dissipative) -> str:
+def _dissipative(c: Dissipative, storage: Storage) -> str:
     text = f"#define TBC_SUB_STEPS {c.sub_steps}\n#define TBC_ETA {floats(np.array(c.eta))}\n"
-    text += _sparse("input", c.input_weight, {"weight": c.input_weight}) + array("input_bias", c.bias)
-    text += _sparse("recurrent", c.recurrent, {"weight": c.recurrent}) + array("shrink", c.shrink)
-    return text + array("readout", c.readout.T) + array("readout_bias", c.readout_bias)
+    text += _sparse("input", c.input_weight, {"weight": c.input_weight}, storage) + array("input_bias", c.bias)
+    text += _sparse("recurrent", c.recurrent, {"weight": c.recurrent}, storage) + array("shrink", c.shrink)
+    return text + _full("readout", c.readout, storage) + array("readout_bias", c.readout_bias)
 
 
 _CHOSEN = """TBC_DT_MIN
@@ -169,46 +210,36 @@ void tbc_low_mean(float membrane[TBC_STATE + 1], const float seen[TBC_LOW_INPUT]
 """
 
 
-def _mlp(name: str, mlp: MLP) -> str:
+def _mlp(name: str, mlp: MLP, storage: Storage) -> str:
     """Weights and one function ``<name>_network(x, y)``."""
-    text, code, source = "", "", "in"
-    last = len(mlp.weights) - 1
-    n_in, n_out = len(mlp.weights[0]), len(mlp.biases[-1])
+    data, declared, layers, source = "", "", "", "in"
+    n_in, last = len(mlp.weights[0]), len(mlp.weights) - 1
     for i, (weight, bias) in enumerate(zip(mlp.weights, mlp.biases, strict=True)):
         inputs, outputs = weight.shape
-        text += array(f"{name}_w{i}", weight.T) + array(f"{name}_b{i}", bias)
-        target = f"h{i}"
-        activation = "linear" if i == last else mlp.activation
-        code += f"    tbc_real h{i}[{outputs}];\n"
-        code += f"    dense_{activation}({inputs}, {outputs}, {name}_w{i}, {name}_b{i}, {source}, {target});\n"
-        source = target
-    declared = "".join(line + "\n" for line in code.splitlines() if line.startswith("    tbc_real"))
-    called = "".join(line + "\n" for line in code.splitlines() if not line.startswith("    tbc_real"))
-    used = {mlp.activation, "linear"} if last else {"linear"}
-    dense = "".join(
-        _DENSE.replace("@KIND@", k).replace("@RULE@", _RULES[k]).replace("@NAME@", name) for k in sorted(used)
-    )
-    called = re.sub(r"dense_", f"{name}_dense_", called)
-    declared = f"    tbc_real in[{n_in}];\n{declared}    int i;\n"
+        data += _full(f"{name}_w{i}", weight, storage) + array(f"{name}_b{i}", bias)
+        declared += f"    tbc_real h{i}[{outputs}];\n"
+        row = f"{name}_row({inputs}, {name}_w{i} + i * {inputs}, {source})"
+        layers += f"    for (i = 0; i < {outputs}; ++i) {{\n"
+        layers += f"        const tbc_real sum = {name}_b{i}[i] + TBC_{name.upper()}_W{i}_STEP(i) * {row};\n"
+        layers += f"        h{i}[i] = {_RULES['linear' if i == last else mlp.activation]};\n    }}\n"
+        source = f"h{i}"
     read = f"    for (i = 0; i < {n_in}; ++i) {{\n        in[i] = x[i];\n    }}\n"
-    written = f"    for (i = 0; i < {n_out}; ++i) {{\n        y[i] = (float){source}[i];\n    }}\n"
-    body = declared + read + called + written
-    return f"{text}\n{dense}\nstatic void {name}_network(const float *x, float *y)\n{{\n{body}}}\n"
+    written = f"    for (i = 0; i < {outputs}; ++i) {{\n        y[i] = (float){source}[i];\n    }}\n"
+    body = f"    tbc_real in[{n_in}];\n{declared}    int i;\n{read}{layers}{written}"
+    row = _ROW.replace("@NAME@", name).replace("@TYPE@", storage.c_type)
+    return f"{data}{row}\nstatic void {name}_network(const float *x, float *y)\n{{\n{body}}}\n"
 
 
-_RULES = {"linear": "sum", "relu": "(sum < 0 ? 0 : sum)", "tanh": "TBC_TANH(sum)"}
-_DENSE = """
-static void @NAME@_dense_@KIND@(int inputs, int outputs, const tbc_real *w, const tbc_real *b, const tbc_real *x,
-                                tbc_real *y)
+_RULES = {"linear": "sum", "relu": "sum < 0 ? 0 : sum", "tanh": "TBC_TANH(sum)"}
+_ROW = """
+static tbc_real @NAME@_row(int inputs, const @TYPE@ *w, const tbc_real *x)
 {
-    int i, j;
-    for (j = 0; j < outputs; ++j) {
-        tbc_real sum = b[j];
-        for (i = 0; i < inputs; ++i) {
-            sum += w[j * inputs + i] * x[i];
-        }
-        y[j] = @RULE@;
+    tbc_real sum = 0;
+    int i;
+    for (i = 0; i < inputs; ++i) {
+        sum += w[i] * x[i];
     }
+    return sum;
 }
 """
 

@@ -27,7 +27,8 @@ from sb3_tbc.zoo.environments import make_env, refuse_other_spaces
 
 STRICT = ("-std=c99", "-pedantic", "-Wall", "-Wextra", "-Werror")
 CORTEX_M4 = ("-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=c99")
-CLOSED_FORM_TOLERANCE = 0.05
+SMALLEST = ("-DTBC_SINGLE", "-DTBC_LOW_LEVEL_ONLY", "-DTBC_INTEGRATED_ONLY")
+TOLERANCE = 0.05
 """Difference of actions, as a share of half their range, above which a warning is printed."""
 
 Observation = Mapping[str, AnyArray]
@@ -181,12 +182,17 @@ class CheckResult(NamedTuple):
         )
 
 
-class ClosedFormResult(NamedTuple):
-    """Comparison of the closed form with the agent: actions on the agent's states, and success when each acts alone."""
+class Departure(NamedTuple):
+    """A policy that computes otherwise than its agent: actions on the agent's states, and success when each acts alone.
 
+    It takes the closed form or has rounded weights.
+    """
+
+    name: str
     beside: CheckResult
     alone: Score
     half_range: float  # of the widest action
+    advice: str
 
     @property
     def share(self) -> float:
@@ -195,17 +201,23 @@ class ClosedFormResult(NamedTuple):
 
     def __str__(self) -> str:
         text = (
-            f"closed form: actions differ from predict's by {self.beside.rms_difference:.2g} rms and "
+            f"{self.name}: actions differ from predict's by {self.beside.rms_difference:.2g} rms and "
             f"{self.beside.max_difference:.2g} at most; acting alone for {self.beside.steps} steps it succeeds in "
             f"{self.alone}, the agent in {self.beside.score}"
         )
-        if self.share <= CLOSED_FORM_TOLERANCE:
+        if self.share <= TOLERANCE:
             return text
         return (
-            f"{text}\nWARNING: the closed form does not act as this agent does (rms {self.share:.0%} of half the range "
-            "of actions): deploy the integrated form. It fits agents better that keep their potentials (memory "
-            "window or episode) than agents that start every step from rest."
+            f"{text}\nWARNING: with {self.name} it does not act as this agent does (rms {self.share:.0%} of half the "
+            f"range of actions): {self.advice}"
         )
+
+
+INTEGRATE = (
+    "deploy the integrated form. The closed form fits agents better that keep their potentials (memory window or "
+    "episode) than agents that start every step from rest."
+)
+KEEP_FLOATS = "compare the successes, over more steps, or export with --weights float32."
 
 
 def player(kind: str, path: Path, policy: ExportedPolicy) -> Player:
@@ -227,16 +239,20 @@ def check(
     :param info: ``env_id`` and ``env_kwargs`` of the task
     :param steps: environment steps; episodes follow one another
     :param seed: seed of the first episode
-    :return: text to print: the comparison, also of a circuit's closed form, and the time of a step in C
+    :return: text to print: the comparison, of weights of eight bits or else also of a circuit's closed form, and the
+        time of a step in C
     :raises ConfigError: if the environment is none that the agent can act in
     """
     env = make_env(info["env_id"], **(info.get("env_kwargs") or {}))
     exported = player(kind, path, policy)
     try:
         refuse_other_spaces(model, env)
-        lines = [str(compare(model, exported, env, steps, seed))]
-        if isinstance(policy.low, Circuit) and isinstance(exported, CPlayer | NumpyPlayer):
-            lines.append(str(compare_closed_form(model, exported, env, steps, seed)))
+        if policy.weights == "int8":
+            lines = [str(compare_rounded(model, exported, env, steps, seed))]
+        else:
+            lines = [str(compare(model, exported, env, steps, seed))]
+            if isinstance(policy.low, Circuit) and isinstance(exported, CPlayer | NumpyPlayer):
+                lines.append(str(compare_closed_form(model, exported, env, steps, seed)))
         if isinstance(exported, CPlayer):
             lines.append(f"one low-level step on this machine: {1e6 * exported.low_step_seconds():.2f} us")
         return "\n".join(lines)
@@ -255,15 +271,24 @@ def compare(model: TBCHRL, exported: Player, env: Env, steps: int, seed: int = 0
 
 def compare_closed_form(
     model: TBCHRL, exported: CPlayer | NumpyPlayer, env: Env, steps: int, seed: int = 0
-) -> ClosedFormResult:
+) -> Departure:
     """Compare the closed form of an exported circuit with the agent, then let it act alone."""
     exported.closed_form = True
+    return _departure("the closed form", INTEGRATE, model, exported, env, steps, seed)
+
+
+def compare_rounded(model: TBCHRL, exported: Player, env: Env, steps: int, seed: int = 0) -> Departure:
+    """Compare a policy with weights of eight bits with the agent, then let it act alone."""
+    return _departure("weights of eight bits", KEEP_FLOATS, model, exported, env, steps, seed)
+
+
+def _departure(name: str, advice: str, model: TBCHRL, exported: Player, env: Env, steps: int, seed: int) -> Departure:
     exported.reset()
     beside = compare(model, exported, env, steps, seed)
     exported.reset()
     actions = action_box(model)
     half_range = 0.5 * float(np.max(actions.high - actions.low))
-    return ClosedFormResult(beside, play(exported, env, steps, seed), half_range)
+    return Departure(name, beside, play(exported, env, steps, seed), half_range, advice)
 
 
 def play(who: Player, env: Env, steps: int, seed: int = 0) -> Score:
@@ -321,7 +346,7 @@ def cortex_m4(path: Path) -> Cortex | None:
         source, target = folder / "policy.c", folder / "policy.o"
         source.write_text(path.read_text(encoding="utf-8"), encoding="utf-8")
         run = [compiler, *CORTEX_M4, "-ffunction-sections", "-fdata-sections"]
-        flags = ["-DTBC_SINGLE", "-DTBC_LOW_LEVEL_ONLY", "-fstack-usage", "-c", str(source), "-o", str(target)]
+        flags = [*SMALLEST, "-fstack-usage", "-c", str(source), "-o", str(target)]
         subprocess.run([*run, *flags], check=True, capture_output=True)
         usage = (folder / "policy.su").read_text(encoding="utf-8")
         flash, data, bss = _sections(target)
@@ -341,8 +366,8 @@ def cortex_m4_report(path: Path) -> str:
     if size is None:
         return f"Cortex-M4 size: not measured (arm-none-eabi-gcc not found; {advice})"
     return (
-        f"Cortex-M4, low level in single precision: {size.flash} bytes of flash, {size.library} more for the "
-        f"mathematical library; RAM {size.state} bytes of state and at most {size.stack} of stack"
+        f"Cortex-M4, low level in single precision, integrated: {size.flash} bytes of flash, {size.library} more for "
+        f"the mathematical library; RAM {size.state} bytes of state and at most {size.stack} of stack"
     )
 
 
@@ -357,7 +382,7 @@ def _linked(run: list[str], folder: Path, source: Path) -> int:
         main.write_text(text, encoding="utf-8")
         elf = folder / f"{name}.elf"
         link = ["--specs=nosys.specs", "-Wl,--gc-sections", str(main), "-o", str(elf), "-lm"]
-        subprocess.run([*run, "-DTBC_SINGLE", "-DTBC_LOW_LEVEL_ONLY", *link], check=True, capture_output=True)
+        subprocess.run([*run, *SMALLEST, *link], check=True, capture_output=True)
         sizes[name] = _sections(elf)[0]
     return sizes["full"] - sizes["empty"]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import MLP, Circuit, ExportedPolicy, extract
+from sb3_tbc.export.rounding import rounded
 from sb3_tbc.extras import require
 from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.pretrained import is_pretrained, model_path
@@ -18,6 +19,7 @@ SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
 
 EXAMPLES = {
     "sb3_tbc.export model.zip --format c": "model.c: one file of C99 for a microcontroller",
+    "sb3_tbc.export model.zip --format c --weights int8 --check 5000": "the same in less flash, and what that costs",
     "sb3_tbc.export model.zip --format onnx --check 1000": "ONNX, compared with the agent over 1000 steps",
     "sb3_tbc.export model.zip --format numpy --output policy.py": "a Python module that needs only NumPy",
 }
@@ -30,6 +32,9 @@ def build_parser() -> Parser:
         "model", type=model_path, metavar="MODEL.zip", help="the agent, with two levels, or pretrained:TASK"
     )
     parser.add_argument("--format", choices=sorted(SUFFIXES), required=True, help="what to write")
+    parser.add_argument("--weights", choices=["float32", "int8"], default="float32", help="int8 rounds the low level's "
+                        "weights to eight bits: C files then need a quarter of the flash for them; the other formats "
+                        "compute with the same rounded weights")  # fmt: skip
     parser.add_argument("--output", type=Path, help="file to write; by default beside the model, with another suffix")
     parser.add_argument("--check", type=positive_int, metavar="STEPS", help="act for this many steps with the agent "
                         "and with the exported policy, and print how much their actions differ")  # fmt: skip
@@ -87,6 +92,8 @@ def command(argv: Sequence[str]) -> int:
     name = args.model.with_suffix(suffix)
     path = args.output or (Path(name.name) if is_pretrained(args.model) else name)  # never into the package
     policy = extract(model, args.model.stem)
+    if args.weights == "int8":
+        policy = rounded(policy)
     WRITERS[args.format](policy, path)
     print(f"{describe(policy)}\nwritten: {path}")
     if args.format == "c":
@@ -99,6 +106,10 @@ def command(argv: Sequence[str]) -> int:
 
         info = identify(args.model, args.env, args.trust)
         print(check(model, policy, args.format, path, info, args.check, args.seed))
+    elif args.weights == "int8":
+        print(
+            "weights of eight bits: not compared with the agent; before you use them, compare them with --check STEPS"
+        )
     elif isinstance(policy.low, Circuit) and args.format != "onnx":
         print("closed form: not compared with the agent; before you use it, compare it with --check STEPS")
     return 0

@@ -147,6 +147,7 @@ class ExportedPolicy:
     fixed_budget: float | None  # steps of every window, if the high level does not choose them
     action_low: FloatArray
     action_high: FloatArray
+    weights: str = "float32"  # "int8": the low level's were rounded, see sb3_tbc.export.rounding
 
     @property
     def state_dim(self) -> int:

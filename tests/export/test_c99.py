@@ -17,6 +17,7 @@ from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.export.c99 import to_c
 from sb3_tbc.export.check import CPlayer
 from sb3_tbc.export.policy import extract
+from sb3_tbc.export.rounding import rounded
 
 pytestmark = needs_cc
 needs_cpp = pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")
@@ -58,10 +59,12 @@ def test_a_broken_sensor_gives_no_action_and_leaves_the_state(case: str, bad: fl
     assert refusals >= 3
 
 
-@pytest.mark.parametrize("precision", [[], ["-DTBC_SINGLE"]])
+@pytest.mark.parametrize("precision", [[], ["-DTBC_SINGLE"], ["-DTBC_SINGLE", "-DTBC_INTEGRATED_ONLY"]])
 @pytest.mark.parametrize("case", [case for case in CASES if case != "hac"])
-def test_strict_compilers_have_nothing_to_say(case: str, precision: list[str], tmp_path: Path) -> None:
-    (tmp_path / "policy.c").write_text(to_c(extract(make(case)[0], case)))
+@pytest.mark.parametrize("rounding", [False, True])
+def test_strict_compilers_have_nothing_to_say(case: str, precision: list[str], rounding: bool, tmp_path: Path) -> None:
+    policy = extract(make(case)[0], case)
+    (tmp_path / "policy.c").write_text(to_c(rounded(policy) if rounding else policy))
     flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Werror", *precision]
     built = compiled(tmp_path, "cc", *flags, "-c", "policy.c")
     assert built.returncode == 0, built.stderr

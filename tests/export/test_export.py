@@ -260,7 +260,7 @@ def test_a_closed_form_unlike_the_agent_draws_a_warning(tmp_path: Path) -> None:
     assert "closed form: actions differ" in str(faithful)
     assert "WARNING" not in str(faithful)
     unlike = faithful._replace(half_range=1e-3 * faithful.half_range)
-    assert "WARNING: the closed form does not act as this agent does" in str(unlike)
+    assert "WARNING: with the closed form it does not act as this agent does" in str(unlike)
 
 
 def test_the_numpy_module_imports_numpy_alone(pendulum: tuple[TBCHRL, ExportedPolicy], tmp_path: Path) -> None:

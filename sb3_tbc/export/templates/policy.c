@@ -9,9 +9,9 @@
  *
  * The fifth argument chooses how a conductance circuit is evaluated: 0 integrates its sub-steps as in training, 1 takes the
  * closed form. To use the functions from another file, define TBC_DECLARATIONS_ONLY there and include this one.
- * TBC_LOW_LEVEL_ONLY leaves out the high level. Both levels work in double precision, as predict does; define TBC_SINGLE
- * everywhere for processors that have single precision only, at the price of the fourth digit of an action. Compile
- * without -ffast-math, which takes NaN for impossible.
+ * TBC_LOW_LEVEL_ONLY leaves out the high level, TBC_INTEGRATED_ONLY the closed form; the fifth argument has no effect then.
+ * Both levels work in double precision, as predict does; define TBC_SINGLE everywhere for processors that have single
+ * precision only, at the price of the fourth digit of an action. Compile without -ffast-math, which takes NaN for impossible.
  */
 #ifndef @GUARD@
 #define @GUARD@
