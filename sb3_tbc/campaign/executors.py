@@ -9,7 +9,9 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any, Protocol
 
@@ -18,6 +20,9 @@ from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.commands import INTERRUPTED
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
+
+PAUSE = 0.2
+"""Seconds between two looks at a run."""
 
 
 class Handle(Protocol):
@@ -80,7 +85,9 @@ def run_job(job: Job) -> int:
         # When a machine's agent is killed, the run must be gone before another machine continues it.
         process = start_training(job, output, signal.SIGKILL)
         try:
-            return process.wait()
+            while (status := process.poll()) is None:
+                time.sleep(PAUSE)  # Ray's cancel does not interrupt a wait in the system, it is noticed between two
+            return status
         except BaseException:  # cancelled: the run saves itself before this process ends
             process.terminate()
             process.wait()
@@ -211,7 +218,8 @@ class RayExecutor:
         self.started = not self.ray.is_initialized()
         if self.started:
             _check_address(address or os.environ.get("RAY_ADDRESS"))
-            self._join(address)
+            with _kept_handler(signal.SIGTERM):
+                self._join(address)
         # Ray repeats a task whose machine died; the run then continues from its last checkpoint.
         self.run = self.ray.remote(num_cpus=1, max_retries=-1, retry_exceptions=False)(run_job)
 
@@ -229,6 +237,15 @@ class RayExecutor:
         """Leave the cluster, if we were not in it before."""
         if self.started:
             self.ray.shutdown()
+
+
+@contextlib.contextmanager
+def _kept_handler(number: signal.Signals) -> Iterator[None]:
+    """Keep what a signal does: joining a cluster, Ray lets SIGTERM end this process, and its runs with it, unsaved."""
+    before = signal.getsignal(number)
+    yield
+    if threading.current_thread() is threading.main_thread():  # elsewhere neither Ray nor we can set one
+        signal.signal(number, before)
 
 
 def _check_address(address: str | None) -> None:
