@@ -11,7 +11,6 @@ import torch as th
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
 from sb3_tbc.tasks.layouts import layout_of
@@ -124,7 +123,6 @@ def command(argv: Sequence[str]) -> int:
     if args.video is not None:  # checked first, since counting the episodes may take minutes
         from sb3_tbc.zoo.video import record_video, require_film
 
-        require("imageio", extra="video", what="a film")
         require_film(args.video)
     th.set_num_threads(args.num_threads)
     info = identify(args.model, args.env, args.trust)

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
+from types import ModuleType
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.aliases import Env, PlainMapping
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, WriteError
 from sb3_tbc.extras import require
 from sb3_tbc.files import replacing
+from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.goal_spaces import said_success
 from sb3_tbc.tasks.rendering import Overlay, with_caption
 from sb3_tbc.tbc_hrl import TBCHRL
@@ -30,6 +33,9 @@ class _Writer(Protocol):
 
     def append_data(self, frame: Frame) -> None:
         """Add a frame."""
+
+    def close(self) -> None:
+        """Let the encoder end, and wait for it."""
 
 
 def film(model: Agent, env: Env, seed: int | None = None, deterministic: bool = True) -> Iterator[Frame]:
@@ -94,14 +100,29 @@ def _frame(env: Env, shown: Overlay, observation: PlainMapping) -> Frame:
     except Exception as error:  # An environment's own code may fail in any way.
         cure = "" if "MUJOCO_GL" in str(error) else "; without a display, set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
         raise ConfigError(f"the environment cannot be drawn: {error}{cure}") from error
-    if not isinstance(rendered, np.ndarray):
-        raise ConfigError(f"the environment cannot be drawn: render() gave {rendered!r}, not an array; see render_mode")
-    picture = rendered
+    picture = _picture(rendered)
     if not draws_itself:
         picture = with_caption(picture, shown, np.asarray(observation["desired_goal"], dtype=np.float64))
     height, width = picture.shape[:2]
     frame: Frame = picture[: height - height % 2, : width - width % 2]  # the codec needs even sizes
     return frame
+
+
+def _picture(rendered: object) -> Frame:
+    """What an environment rendered, if a film can be made of it.
+
+    :raises ConfigError: otherwise
+    """
+    if not isinstance(rendered, np.ndarray):
+        said = one_line(rendered)
+        raise ConfigError(f"the environment cannot be drawn: render() gave {said}, not an array; see render_mode")
+    colours = rendered.ndim == 3 and rendered.shape[2] == 3 and min(rendered.shape[:2]) > 1
+    if not (colours and np.issubdtype(rendered.dtype, np.integer)):
+        raise ConfigError(
+            "the environment cannot be drawn: a picture has the shape (height, width, 3) and whole numbers from 0 to "
+            f"255, render() gave shape {rendered.shape}, {rendered.dtype}; convert it there, or in a wrapper"
+        )
+    return rendered.astype(np.uint8, copy=False)
 
 
 def record_video(
@@ -119,21 +140,63 @@ def record_video(
     :raises WriteError: if the file cannot be written
     """
     require_film(path)
-    imageio = require("imageio.v2", extra="video", what="a film")
-    fps = frames_per_second(env)
+    frames = (frame for i in range(n_episodes) for frame in film(model, env, seed + i, deterministic))
     with replacing(path) as temporary:
         temporary.touch()  # what the disk refuses is said here in one line, by the encoder in forty
-        writer: _Writer
-        with imageio.get_writer(temporary, fps=fps, macro_block_size=2) as writer:
-            for episode in range(n_episodes):
-                for frame in film(model, env, seed + episode, deterministic):
-                    writer.append_data(frame)
+        try:
+            _encode(frames, temporary, frames_per_second(env))
+        except _EncoderError as error:
+            cure = "see the encoder's lines above; is the disk full?"
+            raise WriteError(f"cannot write {path}: the film is not whole; {cure}") from error
+
+
+class _EncoderError(Exception):
+    """The encoder ended before it had written everything."""
+
+
+def _encode(frames: Iterable[Frame], path: Path, fps: float) -> None:
+    """Write a film.
+
+    :raises ConfigError: for pictures of different sizes
+    :raises _EncoderError: if the file cannot be read afterwards, or the encoder ended early
+    """
+    imageio, ffmpeg = _encoder()
+    writer: _Writer
+    size: tuple[int, ...] | None = None
+    # imageio's own context leaves the encoder at work after an error: it would write the file again
+    with closing(imageio.get_writer(path, fps=fps, macro_block_size=2)) as writer:
+        for frame in frames:
+            if size not in (None, frame.shape):
+                raise ConfigError(f"the pictures of a film must have one size, got {size} and {frame.shape}")
+            size = frame.shape
+            try:
+                writer.append_data(frame)
+            except OSError as error:
+                raise _EncoderError from error
+    try:  # imageio does not look at how the encoder ended
+        ffmpeg.count_frames_and_secs(str(path))
+    except RuntimeError as error:
+        raise _EncoderError from error
+
+
+def _encoder() -> tuple[ModuleType, ModuleType]:
+    """imageio, and its plugin that brings the encoder.
+
+    :raises ConfigError: if one of them, or the encoder's program, is missing
+    """
+    imageio, ffmpeg = (require(name, extra="video", what="a film") for name in ("imageio.v2", "imageio_ffmpeg"))
+    try:
+        ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise ConfigError(f"a film needs the program ffmpeg: {one_line(error)}") from error
+    return imageio, ffmpeg
 
 
 def require_film(path: Path) -> None:
-    """Refuse a name that no film can have.
+    """Refuse, before anything is played, a name that no film can have and a machine that can make none.
 
-    :raises ConfigError: unless it ends in ``.mp4``
+    :raises ConfigError: unless the name ends in ``.mp4`` and the encoder is installed
     """
     if path.suffix != ".mp4":
         raise ConfigError(f"a video's name must end in .mp4, got {path}")
+    _encoder()

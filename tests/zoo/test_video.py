@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ from sb3_tbc.tasks.rendering import SUBGOAL
 
 from sb3_tbc import TBCHRL, evaluate
 from sb3_tbc.errors import ConfigError, WriteError
-from sb3_tbc.zoo.video import episode_frames, film, record_video
+from sb3_tbc.extras import MissingExtraError
+from sb3_tbc.zoo.video import episode_frames, film, record_video, require_film
 
 ENV_ID = "sb3_tbc/Drawbridge-v0"
 
@@ -136,3 +138,73 @@ def test_what_cannot_be_drawn_costs_one_line(model: TBCHRL, tmp_path: Path, monk
         with pytest.raises(ConfigError, match=f"cannot be drawn: .*{message}"):
             record_video(model, env, tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("picture", "message"),
+    [
+        (np.zeros((64, 64), np.uint8), r"\(64, 64\), uint8"),
+        (np.zeros((64, 64, 4), np.uint8), r"\(64, 64, 4\)"),
+        (np.zeros((1, 1, 3), np.uint8), r"\(1, 1, 3\)"),
+        (np.zeros((64, 64, 3)), "float64"),
+    ],
+)
+def test_pictures_that_make_no_film_cost_one_line(
+    model: TBCHRL, picture: Any, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = Painter(100)
+    monkeypatch.setattr(env, "render", lambda: picture)
+    with pytest.raises(ConfigError, match=f"whole numbers from 0 to 255, render.. gave shape .*{message}"):
+        next(episode_frames(model, env, seed=0))
+
+
+def test_a_film_that_ends_in_an_error_leaves_nothing_behind(
+    model: TBCHRL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    env = Painter(100)
+    for late, kind in ((1 / 3, ConfigError), (KeyboardInterrupt(), KeyboardInterrupt)):
+        drawn: list[int] = []
+
+        def render(late: Any = late, drawn: list[int] = drawn) -> Any:
+            drawn.append(0)
+            if len(drawn) < 6:
+                return np.zeros((100, 100, 3), np.uint8)
+            if isinstance(late, BaseException):
+                raise late
+            return np.zeros((80, 100, 3), np.uint8)
+
+        monkeypatch.setattr(env, "render", render)
+        with pytest.raises(kind):
+            record_video(model, env, tmp_path / "a.mp4")
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_film_that_the_disk_does_not_hold_is_none(
+    model: TBCHRL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    path, program = tmp_path / "a.mp4", tmp_path / "ffmpeg"
+    path.write_bytes(b"an earlier film")
+    # an encoder whose output is cut off after a kilobyte, as on a full disk
+    program.write_text(f'#!/bin/sh\nfor last; do :; done\n{ffmpeg.get_ffmpeg_exe()} "$@" && truncate -s 1K "$last"\n')
+    program.chmod(0o755)
+    monkeypatch.setattr(ffmpeg._io, "get_ffmpeg_exe", lambda: str(program))
+    with pytest.raises(WriteError, match=r"cannot write .*a\.mp4: the film is not whole"):
+        record_video(model, gym.make(ENV_ID, render_mode="rgb_array"), path, n_episodes=1)
+    assert path.read_bytes() == b"an earlier film"
+
+
+def test_without_an_encoder_nothing_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+
+    def none_found() -> str:
+        raise RuntimeError("No ffmpeg exe could be found.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(ffmpeg, "get_ffmpeg_exe", none_found)
+        with pytest.raises(ConfigError, match="needs the program ffmpeg: No ffmpeg exe"):
+            require_film(tmp_path / "a.mp4")
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(MissingExtraError, match=r"needs the package imageio_ffmpeg.*sb3_tbc\[video\]"):
+        require_film(tmp_path / "a.mp4")
