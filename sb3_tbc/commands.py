@@ -19,6 +19,8 @@ from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError, Traini
 FAILED = 1
 USER_MISTAKE = 2
 INTERRUPTED = 130
+TOLD = (ConfigError, WriteError, TrainingError, EnvironmentFault, NonFiniteError)
+"""Errors whose message is all that a user needs; of others the traceback is shown."""
 
 
 class Command(NamedTuple):
@@ -115,13 +117,21 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python tries again at its end
         print(f"{name}: error: broken pipe: what reads the output has ended", file=sys.stderr)
         return FAILED
-    except (ConfigError, WriteError, TrainingError, EnvironmentFault, NonFiniteError) as error:
-        line = " ".join(str(error).split())
-        print(f"{name}: error: {line}", file=sys.stderr)
-        return USER_MISTAKE if isinstance(error, ConfigError | WriteError) else FAILED
+    except TOLD as error:
+        return tell(error, name)
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def tell(error: Exception, name: str) -> int:
+    """Print an error of :data:`TOLD` as one line on standard error and return the exit status.
+
+    :param name: who says it
+    """
+    line = " ".join(str(error).split())
+    print(f"{name}: error: {line}", file=sys.stderr, flush=True)
+    return USER_MISTAKE if isinstance(error, ConfigError | WriteError) else FAILED
 
 
 def python() -> str:

@@ -9,9 +9,11 @@ from pathlib import Path
 from optuna.storages import RDBStorage
 from optuna.storages._heartbeat import BaseHeartbeat
 from optuna.storages._rdb import models
-from optuna.storages.journal import JournalFileBackend, JournalStorage
+from optuna.storages.journal import JournalStorage
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
+
+from sb3_tbc.tune.journal import WholeLines
 
 Retry = Callable[[Study, FrozenTrial], None]
 
@@ -28,7 +30,7 @@ class JournalWithHeartbeat(JournalStorage, BaseHeartbeat):
     """
 
     def __init__(self, path: Path, interval: int, grace: int, callback: Retry) -> None:
-        super().__init__(JournalFileBackend(str(path)))
+        super().__init__(WholeLines(path))
         self._folder = path.with_name(path.name + ".alive")
         self._folder.mkdir(exist_ok=True)
         self._interval, self._grace, self._callback = interval, grace, callback

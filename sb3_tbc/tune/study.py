@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 import warnings
 from collections.abc import Iterator
@@ -14,8 +13,6 @@ from typing import Literal
 import numpy as np
 import optuna
 from optuna.storages import BaseStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
-from optuna.storages.journal import JournalFileSymlinkLock
-from optuna.storages.journal._file import get_lock_file
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
@@ -24,6 +21,7 @@ from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.files import explained, write_atomic
 from sb3_tbc.outside import HIDDEN, one_line, without_password
 from sb3_tbc.tune.heartbeat import DatabaseWithHeartbeat, JournalWithHeartbeat
+from sb3_tbc.tune.journal import drop_half_line
 from sb3_tbc.tune.objectives import OBJECTIVES
 from sb3_tbc.tune.search_space import Space, Values, apply, build_space, project, suggest
 from sb3_tbc.zoo.config import RunConfig
@@ -185,28 +183,6 @@ def _first_line(error: Exception, storage: str) -> str:
     secret = storage[len(before) : len(storage) - len(after)] if hidden else ""
     text = text.replace(secret, HIDDEN) if len(secret) > 2 else text
     return one_line(text.splitlines()[0])
-
-
-def drop_half_line(path: Path) -> None:
-    """Remove an incomplete last line that a killed process or a full disk left in a journal.
-
-    Optuna skips such a line, but would append the next one to it, and the two together could not be read.
-    """
-    if not path.is_file():
-        return
-    lock = JournalFileSymlinkLock(str(path))
-    with get_lock_file(lock), path.open("rb+") as file:
-        size = file.seek(0, os.SEEK_END)
-        file.seek(max(size - LONGEST_LINE, 0))
-        tail = file.read()
-        if tail and not tail.endswith(b"\n"):
-            file.truncate(size - len(tail) + tail.rfind(b"\n") + 1)
-            file.flush()
-            os.fsync(file.fileno())
-
-
-LONGEST_LINE = 2**24
-"""Longest possible line of a journal, bytes; the settings of a study take about 100,000."""
 
 
 @contextlib.contextmanager

@@ -19,8 +19,7 @@ import torch as th
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
 
-from sb3_tbc.commands import INTERRUPTED, USER_MISTAKE
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.commands import INTERRUPTED, TOLD, USER_MISTAKE, tell
 from sb3_tbc.outside import one_line
 from sb3_tbc.stopping import StopRequest, stop_request
 from sb3_tbc.tune.pruning import SEED_VALUES, make_pruner
@@ -244,9 +243,8 @@ def _main(job: Job, index: int) -> None:
             work(job, index, stop)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
-    except ConfigError as error:
-        print(f"worker {index}: error: {' '.join(str(error).split())}", file=sys.stderr, flush=True)
-        sys.exit(USER_MISTAKE)
+    except TOLD as error:
+        sys.exit(tell(error, f"worker {index}"))
     except Exception:
         traceback.print_exc()
         sys.exit(1)

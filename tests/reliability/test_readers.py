@@ -15,7 +15,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_arrays
 from sb3_tbc.outside import flat_name, folder_name, in_docstring, number, one_line, without_password
 from sb3_tbc.reading import SettingsLoader, parse_yaml, read_arrays, read_json, read_text, read_yaml, settings_yaml
-from sb3_tbc.tune.study import drop_half_line
+from sb3_tbc.tune.journal import drop_half_line
 from sb3_tbc.zoo.config import parse_overrides, read_file
 from sb3_tbc.zoo.ledger import RunFolder
 

@@ -16,6 +16,8 @@ import pytest
 from optuna.trial import TrialState
 from postgres import private_server
 
+from sb3_tbc.errors import TrainingError, WriteError
+from sb3_tbc.tune import worker
 from sb3_tbc.tune.study import COUNTED, ORIGIN, WORKER, count_done, open_storage
 
 HERE = Path(__file__).parent
@@ -82,6 +84,20 @@ def check(study: optuna.Study, killed: int) -> None:
     assert [t.user_attrs.get(ORIGIN) for t in done].count("default") == 1
     assert all(len(t.user_attrs["seed_values"]) == 2 for t in done)
     assert len({str(t.params) for t in done}) == N_TRIALS
+
+
+@pytest.mark.parametrize(("error", "status"), [(WriteError("no\nspace"), 2), (TrainingError("it fell"), 1)])
+def test_a_workers_error_is_one_line(
+    error: Exception, status: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fails(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(worker, "work", fails)
+    with pytest.raises(SystemExit) as ended:
+        worker._main(worker.Job("study.log", NAME, Path(), 1, "random", "none", 0, "cpu", 60), 3)
+    assert ended.value.code == status
+    assert capsys.readouterr().err == f"worker 3: error: {' '.join(str(error).split())}\n"
 
 
 @pytest.mark.slow
