@@ -15,7 +15,9 @@ class Schedules(NamedTuple):
     actor_step: th.Tensor  # learning rate / (1 - beta1^n)
     critic_step: th.Tensor
     ent_coef_step: th.Tensor
-    correction: th.Tensor  # 1 / sqrt(1 - beta2^n)
+    actor_correction: th.Tensor  # 1 / sqrt(1 - beta2^n)
+    critic_correction: th.Tensor
+    ent_coef_correction: th.Tensor
     tau: th.Tensor
     average_weight: th.Tensor  # 1 - decay of the averaged actor
     target_entropy: th.Tensor

@@ -23,6 +23,7 @@ import torch as th
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_leaves, tree_unflatten
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.arrays import FloatArray
 from sb3_tbc.level.actors import squash
 from sb3_tbc.level.compilation import compile_step
 from sb3_tbc.level.critics import BATCH_MOMENTUM, optimism_of
@@ -214,22 +215,21 @@ class SACUpdate:
 
     def _schedules(self, n_steps: int, tau: float, target_entropy: float) -> th.Tensor:
         """A row of :class:`Schedules` per update."""
-        first = float(self._adam_state(self.policy.actor.optimizer)["step"])
-        count = first + 1 + np.arange(n_steps, dtype=np.float64)
-        options = [optimizer.param_groups[0] for optimizer in self.optimizers()]
-        rates = [option["lr"] / (1 - option["betas"][0] ** count) for option in options]
-        columns = {
-            "actor_step": rates[0],
-            "critic_step": rates[1],
-            "ent_coef_step": rates[-1],
-            "correction": 1 / np.sqrt(1 - options[0]["betas"][1] ** count),
+        # Each optimizer counts its own updates: a temperature that was begun anew is younger than the networks.
+        updates = 1 + np.arange(n_steps, dtype=np.float64)
+        counts = [float(self._adam_state(optimizer)["step"]) + updates for optimizer in self.optimizers()]
+        columns: dict[str, float | FloatArray] = {
             "tau": tau,
-            "average_weight": 1 - np.minimum(self.average_decay, (1 + count) / (10 + count)),
+            "average_weight": 1 - np.minimum(self.average_decay, (1 + counts[0]) / (10 + counts[0])),
             "target_entropy": target_entropy,
         }
-        table = np.empty((n_steps, len(columns)), dtype=np.float32)
-        for column, name in enumerate(Schedules._fields):
-            table[:, column] = columns[name]
+        for name, count, optimizer in zip(("actor", "critic", "ent_coef"), counts, self.optimizers(), strict=False):
+            options = optimizer.param_groups[0]
+            columns[f"{name}_step"] = options["lr"] / (1 - options["betas"][0] ** count)
+            columns[f"{name}_correction"] = 1 / np.sqrt(1 - options["betas"][1] ** count)
+        table = np.zeros((n_steps, len(Schedules._fields)), dtype=np.float32)  # a fixed temperature takes no steps
+        for name, column in columns.items():
+            table[:, Schedules._fields.index(name)] = column
         return th.from_numpy(table)
 
     def _step_for(self, batch_size: int, ent_coef: th.Tensor) -> Callable[..., None]:
@@ -431,8 +431,9 @@ class SACUpdate:
         # of updates n, so they come in as tensors, and one compiled graph serves all updates.
         parameter = (state.actor, state.critic, state.ent)[which]
         step_size = (row.actor_step, row.critic_step, row.ent_coef_step)[which]
+        correction = (row.actor_correction, row.critic_correction, row.ent_coef_correction)[which]
         options = self.optimizers()[which].param_groups[0]
         (beta1, beta2), (mean, square) = options["betas"], state.moments[which]
         mean.lerp_(grad, 1 - beta1)
         square.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
-        parameter.sub_(mean / (square.sqrt() * row.correction + options["eps"]) * step_size)
+        parameter.sub_(mean / (square.sqrt() * correction + options["eps"]) * step_size)

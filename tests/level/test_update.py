@@ -98,6 +98,28 @@ def test_gradients_agree_with_stock_sac(monkeypatch: pytest.MonkeyPatch) -> None
             assert th.allclose(moment[start : start + mine.numel()], expected, rtol=1e-4, atol=1e-7)
 
 
+def test_other_betas_are_those_of_the_networks_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SB3's temperature keeps Adam's defaults."""
+    batches, policy_kwargs = make_batches(), {"net_arch": [16, 16], "optimizer_kwargs": {"betas": (0.5, 0.9)}}
+    level = make_level(batches, policy_kwargs=policy_kwargs)
+    stock = make_stock(level, policy_kwargs=policy_kwargs)
+    train_stock(stock, batches, level_noise(level), monkeypatch)
+    level.train(UPDATES, BATCH)
+    assert level.log_ent_coef.item() == pytest.approx(stock.log_ent_coef.item(), abs=1e-6)
+    assert_same_policies(level, stock)
+
+
+def test_a_temperature_that_begins_anew_counts_its_own_updates() -> None:
+    """Adam's first step is as long as the learning rate, whatever number of updates the networks have had."""
+    level = make_level(make_batches(updates=UPDATES + 1))
+    level.train(UPDATES, BATCH)
+    for part in level.ent_coef_optimizer.state[level.log_ent_coef].values():
+        part.zero_()
+    before = level.log_ent_coef.item()
+    level.train(1, BATCH)
+    assert abs(level.log_ent_coef.item() - before) == pytest.approx(1e-3, rel=1e-3)
+
+
 def test_learning_rate_schedule_reaches_the_update(monkeypatch: pytest.MonkeyPatch) -> None:
     batches = make_batches()
 
