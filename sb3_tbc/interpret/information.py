@@ -53,9 +53,17 @@ def mutual_information(x: NDArray[np.integer], y: NDArray[np.integer]) -> float:
 
 
 def into_quantiles(values: FloatArray, bins: int = ACTIVATION_BINS) -> NDArray[np.int64]:
-    """Bins of about equally many values; equal values share a bin, so a unit that never moves has a single one."""
-    edges = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)[1:-1]))
-    return np.searchsorted(edges, values, side="left").astype(np.int64)
+    """Bins of about equally many values; equal values share a bin, so a unit that never moves has a single one.
+
+    A unit that rests at its largest value for most of the time is told from one that never moves, as one that rests at
+    its smallest is.
+    """
+    edges, top = np.quantile(values, np.linspace(0, 1, bins + 1)[1:-1]), values.max()
+    # Bins hold their upper edge: one at the largest value parts nothing, one at the value next to it parts the largest.
+    below = values[values < top]
+    if below.size:
+        edges[edges == top] = below.max()
+    return np.searchsorted(np.unique(edges), values, side="left").astype(np.int64)
 
 
 def phase_information(

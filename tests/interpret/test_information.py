@@ -42,6 +42,17 @@ def test_quantiles_are_even_and_a_still_unit_has_one_bin() -> None:
     assert set(into_quantiles(np.zeros(100))) == {0}
 
 
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.9])
+def test_a_unit_at_its_upper_limit_tells_as_much_as_its_mirror_image(share: float) -> None:
+    rng = np.random.default_rng(0)
+    windows = [np.where(np.arange(20) < 20 * share, 1.0, rng.random(20))[:, None] for _ in range(50)]
+    upper, lower = phase_information(windows), phase_information([-window for window in windows])
+    assert upper is not None
+    assert lower is not None
+    assert lower.bits[0] > 0.2
+    assert upper.bits[0] == pytest.approx(lower.bits[0], abs=0.02)
+
+
 def test_a_unit_that_counts_the_window_and_one_that_does_not() -> None:
     rng = np.random.default_rng(3)
     windows = [
