@@ -66,6 +66,11 @@ class Findings(NamedTuple):
     lesions: list[LesionResult]
 
     @property
+    def most(self) -> int:
+        """Units clamped together for the figure beside the paper's: its five, or all where there are fewer."""
+        return min(5, len(self.units.names))
+
+    @property
     def all_alike(self) -> bool:
         """Whether every episode was the same, as on a task without chance: intervals then mean nothing."""
         first = self.traces[0].inputs
@@ -168,12 +173,11 @@ def _rounded(values: ArrayLike) -> list[float]:
 
 def summary(found: Findings) -> dict[str, float | None]:
     """Our figures by the names of :data:`PAPER`, and those of their controls."""
-    size = min(5, len(found.units.names))
     information = found.information
     values: dict[str, float | None] = {}
     for form in ("rest", "mean"):
         for what in ("top", "random"):
-            drop = mean_drop(found.lesions, what, size, form)
+            drop = mean_drop(found.lesions, what, found.most, form)
             values[f"drop_{what}5_{form}"] = None if drop is None else drop.drop
     values["mean_correlation"] = found.correlation.mean
     values["mean_correlation_control"] = found.correlation.control_mean

@@ -39,12 +39,12 @@ def figure_rows(found: Findings) -> list[tuple[str, str, str, str]]:
     ours = summary(found)
     rows = [("", "paper (UR5)", "here", "control")]
     rows.append((
-        "drop of success, 5 most active clamped to rest", f"{PAPER['drop_top5']:.1%}", _percent(ours["drop_top5_rest"]),
-        f"{_percent(ours['drop_random5_rest'])} (5 random)",
+        f"drop of success, {found.most} most active clamped to rest", f"{PAPER['drop_top5']:.1%}",
+        _percent(ours["drop_top5_rest"]), f"{_percent(ours['drop_random5_rest'])} ({found.most} random)",
     ))  # fmt: skip
     rows.append((
         "the same, clamped to their means", "-", _percent(ours["drop_top5_mean"]),
-        f"{_percent(ours['drop_random5_mean'])} (5 random)",
+        f"{_percent(ours['drop_random5_mean'])} ({found.most} random)",
     ))  # fmt: skip
     rows.append((
         "mean |r| of units and task features", f"{PAPER['mean_correlation']:.2f}", _number(ours["mean_correlation"]),

@@ -52,6 +52,17 @@ def test_figures_of_a_trained_agent(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert kinds.count(("top", "rest")) == kinds.count(("top", "mean")) == 5
 
 
+def test_the_number_of_clamped_units_is_that_of_a_circuit_with_few(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    circuit = {**CIRCUIT, "inter": 2, "command": 1, "recurrent_command_synapses": 0}
+    assert interpret.main([str(saved(tmp_path, low={"policy_kwargs": {"ndbc": circuit}})), *SHORT]) == 0
+    text = capsys.readouterr().out
+    assert "4 most active clamped to rest" in text
+    assert "(4 random)" in text
+    assert "5 most active" not in text
+
+
 def test_an_mlp_in_the_circuits_place(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = saved(tmp_path, low={"policy_kwargs": {"net_arch": [6, 6], "ndbc": None}})
     assert interpret.main([str(path), *SHORT]) == 0
