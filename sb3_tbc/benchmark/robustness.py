@@ -2,8 +2,9 @@
 
 Each agent acts in the same disturbed episodes of its task. The disturbances are those of
 :class:`~sb3_tbc.tasks.perturb.Perturb`: noise on observations, actions that take effect late, and each physical
-quantity of the task at 0.7 and 1.3 times its value. How smoothly an agent acts is measured beside it: the mean change
-of a unit action from one step to the next, in the same episodes.
+quantity of the task at 0.7 and 1.3 times its value. They come on top of what the agent was trained with, such as hidden
+velocities; of a disturbance that it was trained with, the value tried counts. How smoothly an agent acts is measured
+beside it: the mean change of a unit action from one step to the next, in the same episodes.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.settings import merge
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.stats import wilson_interval
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
@@ -95,9 +97,10 @@ def measure(path: Path, n_episodes: int, seed: int, trust: bool = False) -> list
     env = make_env(env_id, **env_kwargs)
     names: tuple[str, ...] = env.unwrapped.dynamics_names  # type: ignore[attr-defined]
     env.close()
+    own = env_kwargs.get("perturb") or {}
     rows = []
     for title, disturbed in disturbances(names):
-        episodes = episodes_under(model, env_id, {**env_kwargs, "perturb": disturbed}, n_episodes, seed)
+        episodes = episodes_under(model, env_id, {**env_kwargs, "perturb": merge(own, disturbed)}, n_episodes, seed)
         successes = sum(episode.success for episode in episodes)
         rows.append(Robustness(title, str(path), successes, len(episodes), roughness(episodes)))
     return rows

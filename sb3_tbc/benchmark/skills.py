@@ -75,7 +75,8 @@ def load_skill(name: str) -> Skill:
 def delay_skill(steps: int, n_learnt: int = 2048, n_later: int = 256) -> Skill:
     """Repeat the input of ``steps`` control steps ago: uniform numbers in [-1, 1], each held for five steps.
 
-    The first ``steps`` targets of a sequence are zero. Without memory an actor explains at most a third of it.
+    The first ``steps`` targets of a sequence are zero. Without memory an actor explains
+    ``((5 - steps) / 5)^2`` of it, and nothing from five steps on.
 
     :param steps: the delay
     :param n_learnt: sequences to learn from

@@ -15,8 +15,10 @@ from sb3_tbc.benchmark.command import benchmark
 from sb3_tbc.benchmark.robustness import disturbances, measure
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.pretrained import model_path
+from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
-from sb3_tbc.zoo.algorithms import environment_of, load_model, read_zip
+from sb3_tbc.zoo.algorithms import RUN_INFO, environment_of, load_model, read_zip
+from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.runner import evaluation_envs
 
 
@@ -52,6 +54,27 @@ def test_a_good_agent_suffers_from_noise_and_is_what_evaluate_says_without(few: 
     assert rows["noise 0.5"].successes < rows["none"].successes
     assert rows["noise 0.5"].roughness > rows["none"].roughness
     assert rows["none"].interval[0] < rows["none"].successes / 10 <= rows["none"].interval[1]
+
+
+def test_disturbances_come_on_top_of_what_an_agent_was_trained_with(
+    few: None, tmp_path: Path, monkeypatch: Any
+) -> None:
+    own = {"hide_velocities": True, "dynamics_scale": {"gravity": 0.9}, "observation_noise": 0.1}
+    model = TBCHRL("MultiInputPolicy", make_envs("sb3_tbc/Pendulum-v0", 1, 0, {"perturb": own}), compile=False)
+    setattr(model, RUN_INFO, {"env_id": "sb3_tbc/Pendulum-v0", "env_kwargs": {"perturb": own}})
+    model.save(tmp_path / "agent.zip")
+    tried = []
+
+    def noted(model: TBCHRL, env_id: str, env_kwargs: dict[str, Any], *rest: int) -> list[Any]:
+        tried.append(env_kwargs["perturb"])
+        return [SimpleNamespace(success=False, actions=np.zeros((2, 1)))]
+
+    monkeypatch.setattr(robustness, "episodes_under", noted)
+    measure(tmp_path / "agent.zip", 1, seed=0)
+    assert tried[0] == own
+    assert tried[1] == {**own, "observation_noise": 0.5}
+    assert {**own, "dynamics_scale": {"gravity": 0.9, "mass": 1.3}} in tried
+    assert {**own, "dynamics_scale": {"gravity": 1.3}} in tried
 
 
 def test_the_command_prints_agents_side_by_side(few: None, capsys: Any, tmp_path: Path) -> None:
