@@ -138,7 +138,9 @@ def _watched(model: TBCHRL) -> list[tuple[object, str, str]]:
         (SACLevel, "train", "updates"),
         (TBCHRL, "train", "updates"),
         (model.replay_buffer.high, "sample_burst", "batches"),
+        (model.replay_buffer.high, "sample_labelled", "batches"),  # with a duration loss
         (model.replay_buffer.low, "sample_burst", "batches"),
+        (model.replay_buffer.low, "sample_pairs", "batches"),  # for the reachability estimate
         (venv, "step_async", "wrappers"),
         (venv, "step_wait", "wrappers"),
         (venv, "reset", "wrappers"),

@@ -63,6 +63,29 @@ def test_profile_takes_watching_off(monkeypatch):
     assert parts["environment"] == parts["acting"] == 0.0
 
 
+def test_profile_counts_all_draws_of_batches(monkeypatch):
+    """With a duration loss the high level's batches have labels, and the reachability estimate draws its own."""
+    monkeypatch.setattr("sb3_tbc.benchmark.profile.watching_cost", lambda: (0.0, 0.0))
+    levels = {"high": {"batch_size": 4}, "low": {"batch_size": 4}, "gradient_ratio": 0.02}
+    model = benchmark_train.ours("Pendulum", config="paper", compile=False, **levels)
+    model.learn(600)
+    buffers = model.replay_buffer
+    for buffer, name, seconds in ((buffers.high, "sample_labelled", 0.1), (buffers.low, "sample_pairs", 0.002)):
+        draw, calls = getattr(buffer, name), []
+
+        def slow(*args, draw=draw, calls=calls, seconds=seconds):
+            calls.append(time.process_time() + seconds)
+            while time.process_time() < calls[-1]:
+                pass
+            return draw(*args)
+
+        monkeypatch.setattr(buffer, name, slow)
+        parts = profile(model, 600)
+        assert calls
+        assert parts["batches"] > 0.3e6 * len(calls) * seconds / 600
+        monkeypatch.setattr(buffer, name, draw)
+
+
 def test_profile_adds_up_and_leaves_no_trace(monkeypatch):
     monkeypatch.setattr("sb3_tbc.benchmark.profile.watching_cost", lambda: (0.0, 0.0))  # is in what it took, too
     model = benchmark_train.ours("Drawbridge", compile=False)
