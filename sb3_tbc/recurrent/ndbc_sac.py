@@ -25,6 +25,7 @@ from sb3_tbc.ndbc.extractor import input_scale_of
 from sb3_tbc.recurrent.cells import NDBCCell, make_cell
 from sb3_tbc.recurrent.sequences import SequenceReplayBuffer, Sequences, flat, flat_space
 from sb3_tbc.tbc_hrl.environment import episode_starts
+from sb3_tbc.tbc_hrl.last_step import KeepsLastStep
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
 State = tuple[AnyArray, ...]
@@ -216,7 +217,7 @@ class RecurrentSACPolicy(SACPolicy):
         return np.ndim(observation) > len(space.shape or ())
 
 
-class NDBCSAC(PlainAlgorithm, SAC):
+class NDBCSAC(PlainAlgorithm, KeepsLastStep, SAC):
     """Recurrent SAC for tasks that do not show everything: SB3's SAC, learning from sequences.
 
     The actor's memory is an NDBC circuit, or a GRU, LTC or CfC cell; it also sees its last action. Memories are

@@ -128,7 +128,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         if not kept.any():  # only while fewer steps are stored than the burn-in takes
             kept[:, -1] = True
         actions = self.actions[rows, envs]
-        before = np.where(starts[..., None], 0.0, self.actions[rows - 1, envs])
+        unknown = rows == self._oldest  # drawn only where it is all there is
+        before = np.where((starts | unknown)[..., None], 0.0, self.actions[rows - 1, envs])
         seen = self._normalized(self.observations[rows, envs], env)
         then = self._normalized(self.next_observations[rows, envs][kept], env)
         dones = (self.dones * (1 - self.timeouts))[rows, envs][kept]
@@ -153,12 +154,16 @@ class SequenceReplayBuffer(ReplayBuffer):
     def _drawn(self, n: int) -> tuple[AnyArray, AnyArray]:
         """Rows ``(n, time)`` and environments ``(n, 1)`` of sequences that do not run across the newest row."""
         # the action before the oldest row of a ring is gone, also where it was loaded into a larger one
-        left_out = int(self.full or not self.starts[0].all())
+        left_out = int(self.size() > 1 and (self.full or not self.starts[0].all()))
         length = min(self.sequence_length, self.size() - left_out)
         first = np.random.randint(left_out, self.size() - length + 1, size=(n, 1))  # noqa: NPY002, as SB3 draws
-        oldest = self.pos if self.full else 0
         envs = np.random.randint(0, self.n_envs, size=(n, 1))  # noqa: NPY002
-        return (oldest + first + np.arange(length)) % self.buffer_size, envs
+        return (self._oldest + first + np.arange(length)) % self.buffer_size, envs
+
+    @property
+    def _oldest(self) -> int:
+        """Row of the oldest step."""
+        return self.pos if self.full else 0
 
     def save(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """Write what is stored to one file of plain arrays."""

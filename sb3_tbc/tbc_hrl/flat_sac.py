@@ -36,6 +36,7 @@ from sb3_tbc.tbc_hrl.diagnostics import record_settings
 from sb3_tbc.tbc_hrl.environment import attribute_of, in_fitting_vector, in_vector
 from sb3_tbc.tbc_hrl.flat_replay import TerminatingHerReplayBuffer
 from sb3_tbc.tbc_hrl.former_settings import check_sb3_names, without_neutral
+from sb3_tbc.tbc_hrl.last_step import KeepsLastStep
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.saving import UNFIT, PlainAlgorithm
 
@@ -62,7 +63,7 @@ def sb3_arguments(config: FlatConfig) -> Plain:
     }
 
 
-class FlatSAC(PlainAlgorithm, SAC):
+class FlatSAC(PlainAlgorithm, KeepsLastStep, SAC):
     """SB3's SAC, goal-conditioned, with :class:`TerminatingHerReplayBuffer`, under the names of our configurations.
 
     :param policy: ``"MultiInputPolicy"``

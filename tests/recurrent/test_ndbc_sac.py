@@ -192,6 +192,17 @@ def test_actions_before_are_known_in_a_larger_buffer_too(tmp_path: Path) -> None
     th.testing.assert_close(now.inputs[..., 1], th.where(now.starts, 0.0, (time - 1) / 1000))
 
 
+def test_a_buffer_emptied_within_an_episode_is_learnt_from() -> None:
+    model = make().learn(20)  # episodes have three steps
+    model.replay_buffer.reset()  # type: ignore[union-attr]
+    model.learn(1, reset_num_timesteps=False)
+    assert model._n_updates == 11
+    now: Any = model.replay_buffer.sample(5).observations  # type: ignore[union-attr]
+    assert now.inputs.shape == (5, 1, 3)
+    assert not now.starts.any()
+    assert not now.inputs[..., 2].any()  # the action before is gone
+
+
 @pytest.mark.parametrize("n_envs", [1, 3])
 def test_collection_notes_starts_and_actions(n_envs: int) -> None:
     env = make_vec_env(Recall, n_envs)
