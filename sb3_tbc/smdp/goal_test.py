@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
 from sb3_tbc.errors import ConfigError, NonFiniteError
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, said_success
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, goal_space_problems, said_success
 from sb3_tbc.smdp.hindsight import GoalTest
 
 TRIED = 3
@@ -69,6 +69,7 @@ def check_goal_test(venv: VecEnv, infos: list[Plain] | None = None) -> None:
             "the environment has no compute_reward(achieved_goal, desired_goal, info), which learning in hindsight "
             "needs; derive it from gymnasium_robotics.core.GoalEnv"
         )
+    _refuse_other_goals(venv)
     space = deepcopy(check_goal_space(venv.observation_space)["achieved_goal"])
     space.seed(0)
     achieved, desired = (np.stack([space.sample() for _ in range(TRIED)]).astype(np.float64) for _ in range(2))
@@ -93,6 +94,24 @@ def check_goal_test(venv: VecEnv, infos: list[Plain] | None = None) -> None:
             "Learning in hindsight asks for rewards of goals that were never the task's, of whose steps there is no "
             "info: let them depend on the goals alone"
         ) from error
+
+
+def _refuse_other_goals(venv: VecEnv) -> None:
+    """Refuse goals of another size than the task's own, which is asked about them.
+
+    :raises ConfigError: if a wrapper of the vector has changed them
+    """
+    task = venv.unwrapped.observation_space
+    if goal_space_problems(task):  # a wrapper of the vector has made the goals
+        return
+    for key in GOAL_KEYS[1:]:
+        own, given = task[key].shape, venv.observation_space[key].shape  # type: ignore[index]
+        if own != given:
+            raise ConfigError(
+                f"a wrapper of the vector (VecFrameStack) makes {key} of shape {given}, that of the task is {own}, whose "
+                "compute_reward hindsight asks: it would take parts of earlier goals for the present one. Leave goals "
+                "as they are: wrap each environment in one that changes 'observation' alone"
+            )
 
 
 class RewardComparison:

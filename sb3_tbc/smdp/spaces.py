@@ -229,7 +229,7 @@ class SubgoalSpace:
             if (found := self._shape_from(name, space)) != (size,):
                 raise ValueError(
                     f"the subgoal space's {name} map gives {found} of an observation, its own size is "
-                    f"({size},): it was made for other observations. A wrapper that changes them (VecFrameStack) "
+                    f"({size},): it was made for other observations. A wrapper that changes them "
                     "needs a subgoal space of its own, subgoals=SubgoalSpace(...)"
                 )
             for n in (2, 3):

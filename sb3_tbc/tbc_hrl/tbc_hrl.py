@@ -230,6 +230,7 @@ class TBCHRL(TwoLevelSaving):
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""
         calls.refuse_vec_normalize(env)
+        check_goal_test(env)
         if self.subgoals is None:
             self.subgoals = attribute_of(env, "subgoals")
         check_goal_strategy(self.config.goal_strategy, self.subgoals)
@@ -240,7 +241,6 @@ class TBCHRL(TwoLevelSaving):
         if self.episode_length is None:
             self.episode_length = episode_length(env)
         self.reward_range = reward_range(env)
-        check_goal_test(env)
 
     _wrap_env = staticmethod(in_vector)
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from gymnasium.wrappers import TransformReward
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
+from sb3_tbc import SubgoalSpace
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.smdp.goal_spaces import said_success
 from sb3_tbc.smdp.goal_test import check_goal_test, goal_test_of
@@ -33,6 +34,18 @@ def test_an_answer_for_one_pair_is_not_taken_for_all() -> None:
     np.testing.assert_array_equal(test.terminated(achieved, desired), [True, False, True])
     np.testing.assert_array_equal(test.terminated(achieved[:1], desired[:1]), [True])
     np.testing.assert_array_equal(test.reward(achieved, desired), [0.0, -1.0, 0.0])
+
+
+def test_stacked_goals_are_refused_with_a_subgoal_space_of_their_own_too() -> None:
+    """The task would take a part of an earlier goal for the present one, and hindsight would learn that."""
+    stacked = VecFrameStack(DummyVecEnv([Corridor]), 2)
+    with pytest.raises(ConfigError, match=r"achieved_goal of shape \(2,\)"):
+        check_goal_test(stacked)
+    scales = {"local_scale": [1.0] * 6, "names": ["before", "now"]}
+    subgoals = SubgoalSpace.from_slices([-1.0] * 2, [1.0] * 2, [0.05] * 2, **scales)
+    for algorithm, more in ((TBCHRL, {"subgoals": subgoals}), (FlatSAC, {})):
+        with pytest.raises(ConfigError, match="changes 'observation' alone"):
+            algorithm("MultiInputPolicy", stacked, **more)
 
 
 class ReadsInfo(Corridor):
