@@ -176,9 +176,7 @@ class RecurrentSACPolicy(SACPolicy):
         """
         self.set_training_mode(False)
         flat_observation = self._flat(observation)
-        memory, last_action = self._blank(len(flat_observation)) if state is None else state
-        if len(memory) != len(flat_observation):
-            raise ValueError(f"state is of {len(memory)} environments, the observation of {len(flat_observation)}")
+        memory, last_action = self._checked(state, len(flat_observation))
         if episode_start is not None:
             fresh = episode_starts(episode_start, len(memory))[:, None]
             memory, last_action = np.where(fresh, 0.0, memory), np.where(fresh, 0.0, last_action)
@@ -199,6 +197,29 @@ class RecurrentSACPolicy(SACPolicy):
     def _blank(self, n: int) -> State:
         width = int(np.prod(self.action_space.shape or ()))
         return np.zeros((n, self.actor.features_extractor.cell.state_dim)), np.zeros((n, width))
+
+    def _checked(self, state: State | None, n: int) -> State:
+        """A state for ``n`` environments: that given, or where there is none, that of episodes that begin.
+
+        :raises ValueError: if it does not fit; NumPy would spread a narrower one over all environments
+        """
+        blank = self._blank(n)
+        if state is None:
+            return blank
+        if not isinstance(state, tuple | list) or len(state) != len(blank):
+            raise ValueError(
+                "state must be what predict returned (memory, last action), or None where episodes begin; got "
+                f"{type(state).__name__}"
+            )
+        memory, last_action = (np.asarray(part) for part in state)
+        if memory.ndim and len(memory) != n:
+            raise ValueError(f"state is of {len(memory)} environments, the observation of {n}")
+        for name, part, own in zip(("memory", "last action"), (memory, last_action), blank, strict=True):
+            if part.shape != own.shape:
+                raise ValueError(
+                    f"state's {name} is of shape {own.shape} here, got {part.shape}: is it of another agent?"
+                )
+        return memory, last_action
 
     def _flat(self, observation: Any) -> AnyArray:
         if isinstance(observation, tuple):

@@ -192,6 +192,20 @@ def test_actions_before_are_known_in_a_larger_buffer_too(tmp_path: Path) -> None
     th.testing.assert_close(now.inputs[..., 1], th.where(now.starts, 0.0, (time - 1) / 1000))
 
 
+@pytest.mark.parametrize(
+    ("state", "said"),
+    [
+        ((np.zeros((2, 8)), np.zeros((1, 1))), r"last action is of shape \(2, 1\) here, got \(1, 1\)"),
+        ((np.zeros((2, 1)), np.zeros((2, 1))), r"memory is of shape \(2, 8\) here, got \(2, 1\)"),
+        (np.zeros((2, 8, 1)), "what predict returned .*got ndarray"),
+        ((np.zeros((2, 8)),), "what predict returned .*got tuple"),
+    ],
+)
+def test_a_state_of_another_shape_is_refused(state: Any, said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        make().predict(np.zeros((2, 2)), state, np.zeros(2, bool))
+
+
 def test_a_buffer_emptied_within_an_episode_is_learnt_from() -> None:
     model = make().learn(20)  # episodes have three steps
     model.replay_buffer.reset()  # type: ignore[union-attr]
