@@ -29,8 +29,8 @@ class NDBCExtractor(BaseFeaturesExtractor):
     :param wiring: the wiring's numbers, as :class:`NDBCWiring` takes them, without ``n_inputs``
     :param input_scale: fixed scales the joined observation is divided by; by default the largest finite bound of each
         entry, and 1 where there is none
-    :param kwargs: further options of :class:`NDBCNet`
-    :raises ValueError: for other spaces
+    :param kwargs: further options of :class:`NDBCNet`, but for ``adaptive_step``
+    :raises ValueError: for other spaces, and for ``adaptive_step``
     """
 
     def __init__(
@@ -41,6 +41,11 @@ class NDBCExtractor(BaseFeaturesExtractor):
         input_scale: Sequence[float] | None = None,
         **kwargs: Any,
     ) -> None:
+        if kwargs.get("adaptive_step", False) is not False:  # K would stay that of the first weights for ever
+            raise ValueError(
+                "adaptive_step looks at the weights after updates, of which SB3 tells no features extractor: leave it "
+                "out and choose sub_steps; NDBCNet itself and NDBCSAC take it"
+            )
         super().__init__(observation_space, features_dim)
         is_dict = isinstance(observation_space, spaces.Dict)
         self.keys = list(observation_space.spaces) if is_dict else []  # type: ignore[attr-defined]

@@ -55,3 +55,10 @@ def test_images_are_scaled_once() -> None:
     extractor = NDBCExtractor(space, features_dim=5)
     given = preprocess_obs(th.full((1, 3, 6, 6), 255), space)
     assert float((given.flatten() * extractor.net.input_gain).max()) == 1.0  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize("rule", [True, {"refresh_every": 5}])
+def test_a_step_rule_that_would_never_look_again_is_refused(rule) -> None:
+    with pytest.raises(ValueError, match="NDBCSAC take it"):
+        NDBCExtractor(spaces.Box(-1.0, 1.0, (3,)), adaptive_step=rule)
+    NDBCExtractor(spaces.Box(-1.0, 1.0, (3,)), adaptive_step=False)
