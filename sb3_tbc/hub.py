@@ -40,8 +40,8 @@ def push_to_hub(
     :param token: of your account; by default that of ``huggingface-cli login``
     :param private: whether a new repository is yours alone to see
     :return: address of the commit
-    :raises ConfigError: if the file does not exist, ``filename`` leads out of the repository, or the Hub refuses or
-        cannot be reached
+    :raises ConfigError: if the file does not exist, ``filename`` leads out of the repository or is none of a ``.zip``,
+        or the Hub refuses or cannot be reached
     """
     # Not huggingface_sb3.push_to_hub: it finds files of the current folder alone, and empties the model card.
     api = require("huggingface_sb3.push_to_hub", extra="hub", what="pushing to the Hub").HfApi()
@@ -61,6 +61,8 @@ def push_to_hub(
 def _inside(folder: Path, filename: str) -> Path:
     """The place of a file in a folder; the folders between are made."""
     path = folder / filename
+    if path.suffix != ".zip":  # saving adds the ending, and the model card has a name of its own
+        raise ConfigError(f"filename must end in .zip, as pendulum/model.zip; got {filename!r}")
     if not path.resolve().is_relative_to(folder.resolve()):
         raise ConfigError(f"filename must lie in the repository, as pendulum/model.zip; got {filename!r}")
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -146,6 +146,9 @@ print("pushed")
             "push_to_hub('nothing.zip', 'owner/agent', '../model.zip')",
             "ConfigError: filename must lie in the repository",
         ),
+        ("push_to_hub(pretrained_path('Pendulum'), 'owner/agent', 'model')", "ConfigError: filename must end in .zip"),
+        ("push_to_hub(pretrained_path('Pendulum'), 'owner/agent', 'README.md')", "ConfigError: filename must end in"),
+        ("push_to_hub(pretrained_path('Pendulum'), 'owner/agent', '')", "ConfigError: filename must end in .zip"),
         ("push_to_hub(pretrained_path('Pendulum'), 'owner/refused', token='x')", "ConfigError: cannot push to owner/"),
     ],
 )

@@ -108,9 +108,9 @@ def _refuse_other_goals(venv: VecEnv) -> None:
         own, given = task[key].shape, venv.observation_space[key].shape  # type: ignore[index]
         if own != given:
             raise ConfigError(
-                f"a wrapper of the vector (VecFrameStack) makes {key} of shape {given}, that of the task is {own}, whose "
-                "compute_reward hindsight asks: it would take parts of earlier goals for the present one. Leave goals "
-                "as they are: wrap each environment in one that changes 'observation' alone"
+                f"a wrapper of the vector (VecFrameStack) makes {key} of shape {given}, that of the task is {own}, "
+                "whose compute_reward hindsight asks: it would take parts of earlier goals for the present one. Leave "
+                "goals as they are: wrap each environment in one that changes 'observation' alone"
             )
 
 

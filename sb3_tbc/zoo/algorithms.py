@@ -20,7 +20,6 @@ from sb3_tbc.tbc_hrl.environment import episode_length
 from sb3_tbc.tbc_hrl.evaluation import Agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.zoo.config import RunConfig
-from sb3_tbc.zoo.environments import make_envs
 
 ALGORITHMS: dict[str, type[TBCHRL] | type[FlatSAC]] = {"tbc-hrl": TBCHRL, "hits": HiTS, "hac": HAC, "sac": FlatSAC}
 RUN_INFO = "run_info"
@@ -122,6 +121,10 @@ def environment_of(path: Path, data: Plain, trust: bool = False) -> tuple[str, P
     return env_id, env_kwargs
 
 
+FLAT = ("stable_baselines3.sac.policies", "sb3_tbc.tbc_hrl.averaged_policy")
+"""Where the policies of flat SAC are."""
+
+
 def algorithm_of(path: Path, data: Plain) -> str:
     """Which algorithm an agent's ``.zip`` belongs to.
 
@@ -132,6 +135,9 @@ def algorithm_of(path: Path, data: Plain) -> str:
     if isinstance(name, str) and name in ALGORITHMS:
         return name
     origin = policy.get("__module__") if isinstance(policy, dict) else None
+    given = data.get("settings")  # SB3's own agents have none
+    if name is None and isinstance(given, dict) and "low" not in given and str(origin) in FLAT:
+        return "sac"
     if name is None and str(origin).startswith("sb3_tbc.tbc_hrl"):  # saved by model.save, without the runner
         settings = data.get("settings", data)  # version 0.1.0 kept them among its other attributes
         if settings.get("low_reward") == "step":
@@ -154,18 +160,14 @@ def load_model(path: Path, env: VecEnv | None = None, device: str = "cpu", trust
     """Load an agent of any of our algorithms.
 
     :param path: the ``.zip``
-    :param env: environments to act in; a flat agent cannot be loaded without and makes its own by default
+    :param env: environments to learn in; to act an agent needs none
     :param device: torch device
     :param trust: whether code from the file may run, see :meth:`.PlainAlgorithm.load`
     :raises UntrustedError: if it cannot be loaded without that
     :raises ConfigError: if it cannot be loaded
     """
-    data = read_zip(path)
-    name = algorithm_of(path, data)
+    name = algorithm_of(path, read_zip(path))
     try:
-        if env is None and ALGORITHMS[name] is FlatSAC:
-            env_id, env_kwargs = environment_of(path, data, trust)
-            env = make_envs(env_id, 1, None, env_kwargs)
         return ALGORITHMS[name].load(path, env=env, device=device, trust=trust)
     except ConfigError:
         raise

@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import torch as th
 from corridor import Corridor
+from stable_baselines3 import SAC
 
 from sb3_tbc import HAC, TBCHRL
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
-from sb3_tbc.zoo.algorithms import algorithm_of, read_zip
+from sb3_tbc.zoo.algorithms import algorithm_of, load_model, read_zip
 
 LEVEL: dict[str, Any] = {"batch_size": 16, "policy_kwargs": {"net_arch": [8, 8]}}
 
@@ -125,6 +127,20 @@ def test_flat_replay_resumes_from_plain_arrays(tmp_path: Path) -> None:
     small = make_flat(buffer_size=100)
     with pytest.raises(ValueError, match="does not fit"):
         small.load_replay_buffer(tmp_path / "replay.pkl")
+
+
+@pytest.mark.parametrize("decay", [0.0, 0.9])
+def test_flat_agents_saved_in_python_are_known_for_what_they_are(decay: float, tmp_path: Path) -> None:
+    model = make_flat(average_decay=decay)
+    model.save(tmp_path / "flat.zip")
+    loaded = load_model(tmp_path / "flat.zip")
+    assert type(loaded) is FlatSAC
+    observation = model.observation_space.sample()
+    actions = [agent.predict(observation, deterministic=True)[0] for agent in (model, loaded)]
+    np.testing.assert_array_equal(*actions)
+    SAC("MultiInputPolicy", Corridor(), buffer_size=10).save(tmp_path / "sb3.zip")
+    with pytest.raises(ConfigError, match="of another algorithm"):
+        load_model(tmp_path / "sb3.zip")
 
 
 def test_flat_mistakes() -> None:
