@@ -124,7 +124,8 @@ STORAGE = {"float32": Storage(float_matrix, "tbc_real", 4), "int8": Storage(whol
 
 
 def _indices(name: str, values: NDArray[np.integer]) -> str:
-    kind = "unsigned char" if values.max(initial=0) < 256 else "unsigned short"
+    kinds = {"unsigned char": 2**8, "unsigned short": 2**16, "int": 2**31}  # int is what indices are read into
+    kind = next(kind for kind, end in kinds.items() if values.max(initial=0) < end)
     listed = ", ".join(str(int(v)) for v in values) or "0"
     return f"static const {kind} {name}[{max(1, len(values))}] = {{{listed}}};\n"
 

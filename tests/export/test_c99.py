@@ -15,8 +15,9 @@ from exported import CASES, make, needs_cc, trained_look
 from sb3_tbc import TBCHRL
 from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.export.c99 import to_c
-from sb3_tbc.export.check import CPlayer
-from sb3_tbc.export.policy import extract
+from sb3_tbc.export.check import CPlayer, NumpyPlayer
+from sb3_tbc.export.numpy_module import to_numpy_module
+from sb3_tbc.export.policy import Circuit, extract
 from sb3_tbc.export.rounding import rounded
 
 pytestmark = needs_cc
@@ -142,3 +143,24 @@ def test_a_time_budget_that_is_not_finite_is_refused(tmp_path: Path) -> None:
     with pytest.raises(NonFiniteError, match="time budget"):
         model.predict(goal, deterministic=True)
     assert np.isnan(player.step(goal)).all()
+
+
+@pytest.mark.parametrize("rounding", [False, True])
+def test_a_circuit_with_more_synapses_than_a_short_counts_acts_as_the_agent(rounding: bool, tmp_path: Path) -> None:
+    """Where a neuron's synapses begin is a number beyond 65,535 then; compilers cut it off with a warning."""
+    wiring = {"inter": 270, "command": 270, "inter_fanout": 250, "synapses": "lean"}
+    env = gym.make("sb3_tbc/Pendulum-v0")
+    low = {"policy_kwargs": {"ndbc": wiring}, "buffer_size": 100}
+    model = TBCHRL("MultiInputPolicy", env, low=low, memory="window", seed=1, compile=False)
+    exact = extract(model)
+    policy = rounded(exact) if rounding else exact
+    assert isinstance(policy.low, Circuit)
+    assert (policy.low.recurrent[:, : policy.low.n_neurons] != 0).sum() > 2**16
+    (tmp_path / "policy.c").write_text(to_c(policy))
+    (tmp_path / "policy.py").write_text(to_numpy_module(policy))
+    c, module = CPlayer(tmp_path / "policy.c", policy), NumpyPlayer(tmp_path / "policy.py")
+    seen, _ = env.reset(seed=0)
+    for _ in range(5):
+        action = c.step(seen)
+        np.testing.assert_allclose(action, module.step(seen), atol=1e-5)
+        seen = env.step(action)[0]
