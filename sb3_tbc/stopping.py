@@ -9,6 +9,9 @@ import threading
 from collections.abc import Callable, Iterator
 from types import FrameType
 
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
+
 SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 """Ctrl-C, a polite kill or a shutdown, and a lost connection."""
 
@@ -42,6 +45,36 @@ class StopRequest:
                 file=sys.stderr,
                 flush=True,
             )
+
+
+class StopEvaluation(Exception):
+    """The user asked to stop while episodes run that can be repeated."""
+
+
+class StoppableVecEnv(VecEnvWrapper):
+    """Environments of an evaluation, which is given up where a stop is asked for.
+
+    :param venv: the environments
+    :param stop: tells whether the user asked to stop; then the next step raises :class:`StopEvaluation`
+    """
+
+    def __init__(self, venv: VecEnv, stop: StopRequest) -> None:
+        super().__init__(venv)
+        self.stop = stop
+
+    def reset(self) -> VecEnvObs:
+        """Begin new episodes."""
+        return self.venv.reset()
+
+    def step_wait(self) -> VecEnvStepReturn:
+        """Finish the step.
+
+        :raises StopEvaluation: when stopped
+        """
+        result = self.venv.step_wait()  # processes are waiting for nothing when this one ends
+        if self.stop:
+            raise StopEvaluation
+        return result
 
 
 @contextlib.contextmanager

@@ -23,7 +23,7 @@ from sb3_tbc.errors import (
 )
 from sb3_tbc.files import explained, locked, remove_stale_lock, save_atomic
 from sb3_tbc.outside import one_line
-from sb3_tbc.stopping import StopRequest
+from sb3_tbc.stopping import StopEvaluation, StoppableVecEnv, StopRequest
 from sb3_tbc.tbc_hrl.evaluation import Agent, evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, build_model, load_model, read_zip
 from sb3_tbc.zoo.callbacks import OptionTraceCallback, StopTraining, SuccessEvalCallback, TimedCheckpointCallback
@@ -316,8 +316,6 @@ class Training:
         if self.options.keep_checkpoint:
             self.checkpoint()
         save_atomic(model.save, self.folder.model)
-        if self.options.stop:
-            raise Interrupted(f"stopped after all {model.num_timesteps} steps, before the result", self.folder.path)
         return finish(model, spec, self.folder, self.options, self.evaluations.wall_time)
 
     def checkpoint(self, save_replay: Callable[[Path], object] | None = None) -> None:
@@ -401,9 +399,14 @@ def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, 
     """Evaluate the trained agent, write the result, and only then remove the checkpoints.
 
     :param trained: seconds that training took
+    :raises Interrupted: when stopped, which may be before the evaluation
+    :raises TrainingError: if an environment fails
     """
     try:
-        result = _final(model, spec, folder, trained)
+        result = _final(model, spec, folder, options.stop, trained)
+    except StopEvaluation as stop:
+        said = f"stopped after all {model.num_timesteps} steps, before the result"
+        raise Interrupted(said, folder.path) from stop
     except (EnvironmentFault, NonFiniteError) as error:
         raise TrainingError(
             f"the evaluation after training failed: {one_line(error, 1000)}. The agent is saved; evaluate it with: "
@@ -415,12 +418,13 @@ def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, 
     return result
 
 
-def _final(model: Agent, spec: RunSpec, folder: RunFolder, trained: float) -> Plain:
+def _final(model: Agent, spec: RunSpec, folder: RunFolder, stop: StopRequest, trained: float) -> Plain:
     """Evaluate the trained agent as ``python -m sb3_tbc.evaluate`` does, on ``eval_seed``."""
     seed = final_seed(spec.seed)
     env = evaluation_envs(spec.env_id, spec.n_final_episodes, seed, spec.run.env_kwargs)
     try:
-        result = evaluate_agent(model, env, spec.n_final_episodes, seed=seed, deterministic=True)
+        watched = StoppableVecEnv(env, stop)
+        result = evaluate_agent(model, watched, spec.n_final_episodes, seed=seed, deterministic=True)
     finally:
         env.close()
     return {

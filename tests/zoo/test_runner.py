@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,11 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sb3_tbc.stopping import StopRequest
 from sb3_tbc.zoo import runner
 from sb3_tbc.zoo.callbacks import EvaluationRow, write_evaluations
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.ledger import RunFolder
-from sb3_tbc.zoo.runner import RunOptions, RunSpec
+from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
 
 
 def test_the_result_is_that_of_the_trained_agent_not_the_best_of_the_curve(
@@ -38,3 +40,30 @@ def test_the_result_is_that_of_the_trained_agent_not_the_best_of_the_curve(
     assert result["outcomes"] == "1110000000"
     assert folder.read_final() == result
     assert evaluated == [(model, 10, {"seed": runner.final_seed(7), "deterministic": True})]
+
+
+@pytest.mark.parametrize("algo", ["hits", "sac"])
+def test_the_evaluation_after_training_stops_on_a_signal_and_is_repeated(
+    algo: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = {"compile": False} if algo == "hits" else {"buffer_size": 1000}
+    run = load_config(algo, "Pendulum", overrides={"n_timesteps": 20, "n_envs": 1, **own})
+    spec = RunSpec(run, "sb3_tbc/Pendulum-v0", seed=3, eval_freq=1000, n_final_episodes=2)
+    folder, undisturbed = RunFolder(tmp_path / "stopped"), RunFolder(tmp_path / "undisturbed")
+    expected = start_run(spec, undisturbed, "", RunOptions(verbose=0))
+    stop = StopRequest()
+
+    def asked_within_the_evaluation(seed: int) -> int:
+        stop.ask(signal.SIGTERM)
+        return runner.evaluation_seed(seed)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(runner, "final_seed", asked_within_the_evaluation)
+        with pytest.raises(Interrupted, match="stopped after all 20 steps, before the result"):
+            start_run(spec, folder, "", RunOptions(verbose=0, stop=stop))
+        assert folder.model.is_file()
+        assert not folder.finished
+        with pytest.raises(Interrupted, match="before the result"):
+            resume_run(folder, RunOptions(stop=stop))
+    timed = {"wall_time": 0, "steps_per_second": 0}
+    assert {**resume_run(folder, RunOptions()), **timed} == {**expected, **timed}
