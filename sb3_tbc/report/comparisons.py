@@ -89,13 +89,23 @@ def difference_of(first: Sequence[Run], second: Sequence[Run]) -> stats.Interval
     combined = stats.difference(interval_of(first), interval_of(second))
     if min(len(first), len(second)) >= stats.FEWEST_SEEDS:
         return combined
-    theirs = {run.final.get("eval_seed"): run.outcomes for run in second}
-    pairs = [(run.outcomes, theirs.get(run.final.get("eval_seed"))) for run in first]
+    ours, theirs = _outcomes_by_seed(first), _outcomes_by_seed(second)
+    pairs = [(outcomes, theirs.get(seed)) for seed, outcomes in ours.items()]
     whole = [(a, b) for a, b in pairs if a and b and len(a) == len(b)]
     if len(whole) < max(len(first), len(second)):
         return combined
     paired = stats.paired_block_bootstrap([a for a, _ in whole], [b for _, b in whole], BLOCK)
     return stats.Interval(combined.mean, min(combined.low, paired.low), max(combined.high, paired.high))
+
+
+def _outcomes_by_seed(runs: Sequence[Run]) -> dict[int, list[int] | None]:
+    """Outcomes of each run's episodes by its evaluation seed; empty where seeds do not tell runs apart, or are missing.
+
+    Without them, which run of the other side has the same episodes would be a guess.
+    """
+    seeds = [run.final.get("eval_seed") for run in runs]
+    alone = None not in seeds and len(set(seeds)) == len(seeds)
+    return {seed: run.outcomes for seed, run in zip(seeds, runs, strict=True) if seed is not None} if alone else {}
 
 
 def mean_curve(runs: Sequence[Run]) -> tuple[list[int], list[float]] | None:

@@ -75,11 +75,13 @@ def _success_row(task: str, method: str, runs: Sequence[Run]) -> list[str]:
 
 
 def steps_to_90(runs: Sequence[Run]) -> str:
-    """Mean steps until an evaluation first succeeds in 0.9 of its episodes, or how many seeds reach that."""
-    first = [stats.steps_to(*run.curve, 0.9) for run in runs]
+    """Mean steps until an evaluation first succeeds in 0.9 of its episodes, or how many of the evaluated seeds do."""
+    first = [stats.steps_to(*run.curve, 0.9) for run in runs if run.rows]
     reached = [steps for steps in first if steps is not None]
-    all_reached = len(reached) == len(runs)
-    return f"{np.mean(reached) / 1000:.0f} k" if all_reached else f"{len(reached)} of {len(runs)} seeds"
+    if not first:
+        return "-"
+    all_reached = len(reached) == len(first)
+    return f"{np.mean(reached) / 1000:.0f} k" if all_reached else f"{len(reached)} of {len(first)} seeds"
 
 
 def worst(runs: Sequence[Run]) -> str:

@@ -12,6 +12,7 @@ import yaml
 from made_up_runs import fake_run
 from sb3_tbc.tasks import make_task
 
+from sb3_tbc import stats
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.report import tables
 from sb3_tbc.report.claims import HOLDS, SAME, claims
@@ -392,3 +393,23 @@ def test_episodes_pair_by_the_seed_they_were_evaluated_on(tmp_path: Path) -> Non
     assert paired.mean == apart.mean == 0.0
     assert paired.low < apart.low - 0.1
     assert paired.high > apart.high + 0.1
+
+
+@pytest.mark.parametrize("eval_seed", [None, 7])
+def test_episodes_of_which_no_seed_says_that_they_are_the_same_are_taken_apart(
+    eval_seed: int | None, tmp_path: Path
+) -> None:
+    """Every run of ours was paired with the last one of the other side: the interval hung on the order of seeds."""
+    first, second = "1" * 50 + "0" * 50, "0" * 50 + "1" * 50
+    for seed, theirs in enumerate((first, second)):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.5, outcomes=first, eval_seed=eval_seed)
+        fake_run(tmp_path, "A", "hits", seed, 0.5, outcomes=theirs, eval_seed=eval_seed)
+    ours, others = (load_results(tmp_path)["A"][method] for method in ("tbc-hrl", "hits"))
+    assert difference_of(ours, others) == stats.difference(interval_of(ours), interval_of(others))
+
+
+def test_seeds_that_were_never_evaluated_in_training_do_not_count_as_never_there(tmp_path: Path) -> None:
+    for seed, curve in enumerate(([], [0.5, 0.95], [])):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, curve=curve)
+    runs = load_results(tmp_path)["A"]["tbc-hrl"]
+    assert [tables.steps_to_90(chosen) for chosen in (runs, runs[:1])] == ["2 k", "-"]
