@@ -44,6 +44,10 @@ def find_trial(study: Study, which: str) -> FrozenTrial:
     trial = trials[int(which)]
     if trial.state == TrialState.WAITING:
         raise ConfigError(f"trial {which} has not begun yet")
+    if not trial.params and not trial.user_attrs.get(ORIGIN):  # it would be the settings that are not searched
+        raise ConfigError(
+            f"trial {which} has chosen no settings: it was dropped, or has just begun; trials.csv lists all"
+        )
     return trial
 
 

@@ -6,8 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import optuna
+import pytest
 
-from sb3_tbc.tune.results import difference, importances, write_plots
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.tune.results import difference, find_trial, importances, write_plots
+from sb3_tbc.tune.study import ORIGIN
 
 
 def test_plots_and_importances(tmp_path: Path) -> None:
@@ -39,3 +42,13 @@ def test_difference_is_what_merging_needs() -> None:
         "e": None,
     }
     assert difference({"a": 1}, {"a": True}) == {"a": True}
+
+
+def test_a_trial_that_chose_nothing_has_no_settings_to_train_on() -> None:
+    """Of two workers that begin the last trial one drops its own: training on it took the settings of no trial."""
+    study = optuna.create_study()
+    study.tell(study.ask(), state=optuna.trial.TrialState.FAIL)
+    with pytest.raises(ConfigError, match="trial 0 has chosen no settings: it was dropped, or has just begun"):
+        find_trial(study, "0")
+    study.add_trial(optuna.trial.create_trial(state=optuna.trial.TrialState.FAIL, user_attrs={ORIGIN: "paper"}))
+    assert find_trial(study, "1").number == 1  # its settings are those of its configuration
