@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_yaml
 from sb3_tbc.report.runs import SHIPPED, Results, Run
@@ -18,6 +18,10 @@ from sb3_tbc.zoo.config import N_EVAL_EPISODES, OF_PAPER, default_eval_freq, loa
 CAMPAIGN = "campaign.yml"
 """In the folder of results: ``first_seed``, ``options`` of every command, and ``runs`` with task, methods, seeds, and
 ``first_seed`` and ``options`` of their own."""
+
+
+OF_PLAN = ("first_seed", "options", "runs")
+OF_ROW = ("task", "methods", "seeds", "first_seed", "n_timesteps", "options")
 
 
 class Planned(NamedTuple):
@@ -99,7 +103,11 @@ def missing_table(root: Path, results: Results) -> list[list[str]]:
 
 
 def _rows(plan: Plain) -> Iterator[Planned]:
+    _check_keys(plan, OF_PLAN, ("runs",))
     for row in plan["runs"]:
+        _check_keys(row, OF_ROW, OF_ROW[:3])
+        if not isinstance(row["methods"], list):
+            raise ConfigError(f"methods must be a list, as [tbc-hrl, hits], got {one_line(repr(row['methods']))}")
         first, count = int((row if "first_seed" in row else plan)["first_seed"]), int(row["seeds"])
         options = _words((row if "options" in row else plan).get("options") or [])
         steps = int(row["n_timesteps"]) if "n_timesteps" in row else None
@@ -107,6 +115,17 @@ def _rows(plan: Plain) -> Iterator[Planned]:
             raise ConfigError(f"first_seed is 0 or more, seeds and n_timesteps are 1 or more, got {one_line(row)}")
         for method in row["methods"]:
             yield Planned(str(row["task"]), str(method), range(first, first + count), steps, options)
+
+
+def _check_keys(part: Plain, known: Sequence[str], needed: Sequence[str]) -> None:
+    """Refuse keys that nobody reads: with ``n_timestep`` the plan would be one of other steps, without a word.
+
+    :raises ConfigError: naming the first one that is unknown or missing
+    """
+    if unknown := [str(key) for key in part if key not in known]:
+        raise ConfigError(f"unknown key {unknown[0]!r} in {one_line(part)}; {nearest(unknown[0], known)}")
+    if missing := [key for key in needed if key not in part]:
+        raise ConfigError(f"{missing[0]} is missing in {one_line(part)}")
 
 
 def _words(options: object) -> list[str]:

@@ -112,3 +112,19 @@ def test_plans_that_evaluate_a_task_at_other_steps_are_refused(tmp_path: Path) -
     plan.write_text(f"{{first_seed: 0, options: [--eval-freq], runs: [{rows}]}}")
     with pytest.raises(ConfigError, match="cannot read the plan"):
         missing_table(tmp_path, load_results(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("plan", "said"),
+    [
+        ("runs: [{task: A, seeds: 2, methods: [hits], n_timestep: 5}]", "unknown key 'n_timestep' .*'n_timesteps'"),
+        ("runs: [{task: A, methods: [hits]}]", "seeds is missing in"),
+        ("runs: [{task: A, seeds: 2, methods: hits}]", "methods must be a list, as .*, got 'hits'"),
+        ("run: []", "unknown key 'run' .*'runs'"),
+        ("{}", "runs is missing in"),
+    ],
+)
+def test_keys_of_a_plan_that_nobody_reads_or_that_are_missing(plan: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "campaign.yml").write_text(plan if plan == "{}" else f"first_seed: 0\n{plan}\n")
+    with pytest.raises(ConfigError, match=said):
+        missing_table(tmp_path, {})
