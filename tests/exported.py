@@ -5,11 +5,13 @@ from __future__ import annotations
 import shutil
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 from test_events import Bell
 
 from sb3_tbc import TBCHRL
+from sb3_tbc.export.check import Player
 from sb3_tbc.tbc_hrl import HAC
 
 needs_cc = pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
@@ -55,3 +57,16 @@ def trained_look(model: TBCHRL, seed: int = 0) -> TBCHRL:
                     p[::2] = 12.0
         level.refresh()
     return model
+
+
+def assert_same_actions(one: Player, other: Player, env: gym.Env, steps: int, seed: int = 0) -> None:
+    """Both act alike, from the beginning of an episode on, in the states that the first one's actions lead to."""
+    seen, _ = env.reset(seed=seed)
+    for _ in range(steps):
+        action = one.step(seen)
+        np.testing.assert_allclose(other.step(seen), action, atol=1e-5)
+        seen, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            seen, _ = env.reset()
+            one.reset()
+            other.reset()

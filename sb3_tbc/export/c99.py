@@ -22,9 +22,7 @@ Entries = tuple[NDArray[np.integer], NDArray[np.integer]]
 class Storage(NamedTuple):
     """How weight matrices are stored."""
 
-    write: Callable[
-        [str, FloatArray, Entries], str
-    ]  # an array of a name, and TBC_<NAME>_STEP(o), its unit for an output
+    write: Callable[[str, FloatArray, Entries], str]  # an array of a name; TBC_<NAME>_STEP(o), its unit for an output
     c_type: str
     size: int  # bytes of an entry, in single precision
 

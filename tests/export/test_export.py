@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from exported import CASES, PENDULUM, make, needs_cc, trained_look
+from exported import CASES, PENDULUM, assert_same_actions, make, needs_cc, trained_look
 
 import sb3_tbc.export.command
 from sb3_tbc import TBCHRL, train
@@ -110,15 +110,7 @@ def assert_every_format_agrees(model: TBCHRL, env: gym.Env, folder: Path) -> Non
         in_c.closed_form = in_numpy.closed_form = True
         for one in (in_c, in_numpy):
             one.reset()
-        observation, _ = env.reset(seed=1)
-        for _ in range(1000):
-            action = in_c.step(observation)
-            np.testing.assert_allclose(in_numpy.step(observation), action, atol=1e-5)
-            observation, _, terminated, truncated, _ = env.step(action)
-            if terminated or truncated:
-                observation, _ = env.reset()
-                in_c.reset()
-                in_numpy.reset()
+        assert_same_actions(in_c, in_numpy, env, 1000, seed=1)
 
 
 @pytest.mark.parametrize("case", ["reached", "memoryless", "lean reflex"])

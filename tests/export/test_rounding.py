@@ -9,7 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from exported import CASES, make, needs_cc, trained_look
+from exported import CASES, assert_same_actions, make, needs_cc, trained_look
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
@@ -93,15 +93,7 @@ def test_the_c_file_computes_with_the_rounded_weights(case: str, flags: tuple[st
         sb3_tbc.export.command.WRITERS[kind](policy, tmp_path / f"policy{sb3_tbc.export.command.SUFFIXES[kind]}")
     assert "static const signed char" in (tmp_path / "policy.c").read_text()
     c, module = CPlayer(tmp_path / "policy.c", policy, flags), NumpyPlayer(tmp_path / "policy.py")
-    seen, _ = env.reset(seed=0)
-    for _ in range(200):
-        action = module.step(seen)
-        np.testing.assert_allclose(c.step(seen), action, atol=1e-5)
-        seen, _, terminated, truncated, _ = env.step(action)
-        if terminated or truncated:
-            seen, _ = env.reset()
-            c.reset()
-            module.reset()
+    assert_same_actions(module, c, env, 200)
 
 
 @needs_cc
