@@ -10,9 +10,9 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tbc.settings import hints
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.settings import SettingError, hints
 from sb3_tbc.tbc_hrl.config import TBCConfig
-from sb3_tbc.tbc_hrl.former_settings import OF_SB3_ALONE
 
 
 def whole_steps(total_timesteps: Any) -> int:
@@ -52,41 +52,6 @@ def refuse_vec_normalize(env: VecEnv) -> None:
         )
 
 
-OF_A_LEVEL = ("gamma", "tau", "batch_size", "buffer_size", "ent_coef", "target_entropy", "learning_rate")
-"""What SB3's agents of one level let users change between two calls of ``learn``."""
-
-
-def explain_level_setting(name: str) -> None:
-    """Say where to read what each level has for itself.
-
-    :raises AttributeError: if it is such a setting
-    """
-    if name in OF_A_LEVEL:
-        raise AttributeError(
-            f"{name} belongs to a level, and there are two: read model.low_settings[{name!r}] and "
-            f"model.high_settings[{name!r}]"
-        )
-
-
-CHANGEABLE_LATER = ("gradient_ratio", "learning_starts")
-"""Settings of the agent that may be set at any time: they are read at each burst of updates."""
-OF_THE_AGENT = frozenset((*hints(TBCConfig), *OF_SB3_ALONE)) - {"high", "low", "use_sde", "sde_sample_freq"}
-"""What belongs to the agent as a whole, here or in SB3; SB3 itself sets the two that are left out."""
-
-
-def refuse_fixed(name: str, value: object) -> None:
-    """Refuse to set what is fixed when an agent is made, or what there is not here.
-
-    :raises AttributeError: naming what to do instead
-    """
-    if name in OF_SB3_ALONE:
-        raise AttributeError(f"{name} is nothing that can be set: {OF_SB3_ALONE[name]}")
-    if name not in CHANGEABLE_LATER:
-        raise AttributeError(
-            f"{name} is fixed when the agent is made or loaded: save it, and load(path, env, {name}={value!r})"
-        )
-
-
 def refuse_policy(policy: object, known: Iterable[str]) -> None:
     """Refuse a policy of Stable-Baselines3 that there is not here.
 
@@ -108,13 +73,119 @@ def refuse_no_environment(env: object) -> None:
         raise ValueError("an agent is built for an environment, got env=None; TBCHRL.load needs none to act")
 
 
+# --------------------------------------------------------------------------------------------- names of SB3's SAC
+
+
+_UPDATES = "updates follow what was collected; gradient_ratio says how many there are for each environment step"
+_REPLAY = "the replay buffers are the agent's own; buffer_size, n_hindsight_goals and goal_strategy shape them"
+_NOISE = "exploration is that of SAC's stochastic policy"
+OF_SB3_ALONE = {
+    "train_freq": _UPDATES,
+    "gradient_steps": _UPDATES,
+    "target_update_interval": "target critics follow with each update, by tau",
+    "action_noise": _NOISE,
+    "use_sde": _NOISE,
+    "sde_sample_freq": _NOISE,
+    "use_sde_at_warmup": _NOISE,
+    "replay_buffer_class": _REPLAY,
+    "replay_buffer_kwargs": _REPLAY,
+    "optimize_memory_usage": _REPLAY,
+    "n_steps": "returns are of one step",
+}
+"""Arguments of Stable-Baselines3's SAC that there are not here, and what there is."""
+NEUTRAL: Plain = {
+    "action_noise": None,
+    "use_sde": False,
+    "sde_sample_freq": -1,
+    "use_sde_at_warmup": False,
+    "replay_buffer_class": None,
+    "replay_buffer_kwargs": None,
+    "optimize_memory_usage": False,
+    "n_steps": 1,
+}
+"""Values of them that ask for nothing: Stable-Baselines3's defaults, which scripts and wrappers hand on."""
+
+
+def without_sb3_names(given: PlainMapping) -> Plain:
+    """Arguments without those in :data:`OF_SB3_ALONE`, which may only be given where they ask for nothing.
+
+    :raises SettingError: if one asks for something, saying what there is in its place
+    """
+    for name, instead in OF_SB3_ALONE.items():
+        if name in given and not _asks_for_nothing(name, given[name]):
+            raise SettingError(name, f"is not taken: {instead}")
+    return {name: value for name, value in given.items() if name not in OF_SB3_ALONE}
+
+
+def _asks_for_nothing(name: str, value: object) -> bool:
+    return name in NEUTRAL and type(value) is type(NEUTRAL[name]) and bool(value == NEUTRAL[name])
+
+
+LEVEL_NAMES = ("actor_learning_rate", "batch_size", "buffer_size", "ent_coef", "gamma", "policy_kwargs", "tau",
+               "target_entropy", "average_decay", "ent_coef_learning_rate", "learning_rate")  # fmt: skip
+"""Settings that Stable-Baselines3 takes for the whole agent, and an agent of two levels for each level."""
+
+
+def refuse_level_names(given: PlainMapping) -> None:
+    """Refuse a level's setting that is given for the whole agent.
+
+    :raises SettingError: naming where it belongs
+    """
+    for name in LEVEL_NAMES:
+        if name in given:
+            raise SettingError(
+                name,
+                f"belongs to a level, and there are two: use low={{{name!r}: ...}} and high={{{name!r}: ...}} "
+                f"in place of {name}={given[name]!r}",
+            )
+
+
+# -------------------------------------------------------------------------------------------- attributes of agents
+
+
+OF_A_LEVEL = ("gamma", "tau", "batch_size", "buffer_size", "ent_coef", "target_entropy", "learning_rate")
+"""What SB3's agents of one level let users change between two calls of ``learn``."""
+
+
+def explain_level_setting(name: str) -> None:
+    """Say where to read what each level has for itself.
+
+    :raises AttributeError: if it is such a setting
+    """
+    if name in OF_A_LEVEL:
+        raise AttributeError(
+            f"{name} belongs to a level, and there are two: read model.low_settings[{name!r}] and "
+            f"model.high_settings[{name!r}]"
+        )
+
+
 def refuse_level_setting(name: str, value: object) -> None:
     """Refuse to set on the agent what its levels would never read.
 
+    :param name: of :data:`OF_A_LEVEL`
     :raises AttributeError: naming what to do instead
     """
-    if name in OF_A_LEVEL and (name != "learning_rate" or value != 0.0):  # SB3 sets that one itself
+    if name != "learning_rate" or value != 0.0:  # SB3 sets that one itself
         raise AttributeError(
             f"{name} belongs to a level, and there are two: load the saved agent with other settings, "
             f"load(path, env, low={{{name!r}: {value!r}}}) or high={{...}}"
+        )
+
+
+CHANGEABLE_LATER = ("gradient_ratio", "learning_starts")
+"""Settings of the agent that may be set at any time: they are read at each burst of updates."""
+OF_THE_AGENT = frozenset((*hints(TBCConfig), *OF_SB3_ALONE)) - {"high", "low", "use_sde", "sde_sample_freq"}
+"""What belongs to the agent as a whole, here or in SB3; SB3 itself sets the two that are left out."""
+
+
+def refuse_fixed(name: str, value: object) -> None:
+    """Refuse to set what is fixed when an agent is made, or what there is not here.
+
+    :raises AttributeError: naming what to do instead
+    """
+    if name in OF_SB3_ALONE:
+        raise AttributeError(f"{name} is nothing that can be set: {OF_SB3_ALONE[name]}")
+    if name not in CHANGEABLE_LATER:
+        raise AttributeError(
+            f"{name} is fixed when the agent is made or loaded: save it, and load(path, env, {name}={value!r})"
         )

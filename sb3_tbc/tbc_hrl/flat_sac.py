@@ -30,12 +30,11 @@ from sb3_tbc.smdp.hindsight import check_goal_strategy
 from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSettings, takes
 from sb3_tbc.tbc_hrl.averaged_policy import AveragedPolicy
-from sb3_tbc.tbc_hrl.calls import refuse_policy, refuse_vec_normalize, whole_steps
+from sb3_tbc.tbc_hrl.calls import refuse_policy, refuse_vec_normalize, whole_steps, without_sb3_names
 from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.diagnostics import record_settings
 from sb3_tbc.tbc_hrl.environment import attribute_of, in_fitting_vector, in_vector
 from sb3_tbc.tbc_hrl.flat_replay import TerminatingHerReplayBuffer
-from sb3_tbc.tbc_hrl.former_settings import check_sb3_names, without_neutral
 from sb3_tbc.tbc_hrl.last_step import KeepsLastStep
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.saving import UNFIT, PlainAlgorithm
@@ -84,8 +83,7 @@ class FlatSAC(PlainAlgorithm, KeepsLastStep, SAC):
     @takes(FlatArguments)
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str, **arguments: object) -> None:
         refuse_policy(policy, self.policy_aliases)
-        check_sb3_names(arguments := without_neutral(arguments))
-        sb3, settings = SB3Arguments.taken_from(arguments)
+        sb3, settings = SB3Arguments.taken_from(without_sb3_names(arguments))
         config = self.config_class.from_dict(settings)
         self.settings = config.to_dict()
         self.gradient_ratio = config.gradient_ratio

@@ -21,8 +21,7 @@ from sb3_tbc.settings import SettingError, Settings, hints, plain
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import named_reset
 from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
-from sb3_tbc.tbc_hrl.calls import device_here
-from sb3_tbc.tbc_hrl.former_settings import check_sb3_names, without_neutral
+from sb3_tbc.tbc_hrl.calls import device_here, without_sb3_names
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
 
 SelfPlain = TypeVar("SelfPlain", bound="PlainAlgorithm")
@@ -108,9 +107,8 @@ class PlainAlgorithm(BaseAlgorithm):
         """
         own = hints(cls.config_class)
         changes = {name: plain(value) if name in own else value for name, value in given.items()}
-        changes = without_neutral(changes) if own else changes
         if own:
-            check_sb3_names(changes)
+            changes = without_sb3_names(changes)
         known = {*data, *own, *cls.more_changes}
         for name in changes:
             if name not in known:

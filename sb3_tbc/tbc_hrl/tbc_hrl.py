@@ -41,7 +41,7 @@ from sb3_tbc.tbc_hrl.diagnostics import (
 )
 from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, in_fitting_vector, in_vector, reward_range
 from sb3_tbc.tbc_hrl.foreign_high import put_together
-from sb3_tbc.tbc_hrl.former_settings import check_top_names, take_settings, without_neutral
+from sb3_tbc.tbc_hrl.former_settings import take_settings
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.live_settings import LiveSettings
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
@@ -82,7 +82,7 @@ class TBCHRL(TwoLevelSaving):
     @takes(TBCArguments)
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **arguments: object) -> None:
         calls.refuse_policy(policy, self.policy_aliases)
-        check_top_names(arguments := without_neutral(arguments))
+        calls.refuse_level_names(arguments := calls.without_sb3_names(arguments))
         others, settings = HierarchyArguments.taken_from(arguments)
         config = self.config_class.from_dict(settings)
         super().__init__(

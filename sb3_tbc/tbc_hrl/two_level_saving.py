@@ -20,10 +20,10 @@ from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.settings import SettingError, plain
 from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.assembly import LevelSpaces
+from sb3_tbc.tbc_hrl.calls import LEVEL_NAMES
 from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.environment import mismatch_explained
-from sb3_tbc.tbc_hrl.former_settings import LEVEL_NAMES
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
 from sb3_tbc.tbc_hrl.reachability import Reachability
 from sb3_tbc.tbc_hrl.saving import UNFIT, PlainAlgorithm, leaves
