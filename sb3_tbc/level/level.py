@@ -79,6 +79,8 @@ class SACLevel(SAC):
     """
 
     policy: LevelPolicy
+    observation_space: spaces.Box
+    action_space: spaces.Box
 
     def __init__(
         self,

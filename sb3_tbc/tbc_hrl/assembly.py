@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from typing import NamedTuple, cast
 
+import numpy as np
 from gymnasium import spaces
 
 from sb3_tbc.aliases import Plain
@@ -25,18 +25,6 @@ from sb3_tbc.tbc_hrl.reachability import Reachability
 from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
 
 logger = logging.getLogger(__name__)
-
-
-class LevelSpaces(NamedTuple):
-    """What a level sees and what it chooses, flat vectors both."""
-
-    observation: spaces.Box
-    action: spaces.Box
-
-    @classmethod
-    def of_level(cls, level: SACLevel) -> LevelSpaces:
-        """The spaces that a level was made with."""
-        return cls(cast(spaces.Box, level.observation_space), cast(spaces.Box, level.action_space))
 
 
 # ------------------------------------------------------------------------------- the semi-Markov process
@@ -148,41 +136,48 @@ def _given_bounds(level: LevelConfig) -> ValueBounds | None:
     return None if isinstance(level.target_bounds, str) else ValueBounds(*level.target_bounds)
 
 
-def make_high_level(config: TBCConfig, ends: LevelSpaces, seed: int, bounds: ValueBounds | None) -> SACLevel:
-    """The level that chooses subgoals and time budgets."""
+def make_high_level(
+    config: TBCConfig, views: LevelViews, observations: spaces.Dict, seed: int, bounds: ValueBounds | None
+) -> SACLevel:
+    """The level that chooses subgoals and time budgets.
+
+    :param observations: the task's
+    """
     policy_kwargs = config.high.policy_kwargs.to_kwargs()
     if policy_kwargs["negative_critic"] is None:
         policy_kwargs["negative_critic"] = not config.bonus_beyond_cost
-    return _make_level("high", config, config.high, ends, policy_kwargs, seed, bounds)
+    seen, chosen = views.high_space(observations), views.high_action_space()
+    return _make_level("high", config, config.high, seen, chosen, policy_kwargs, seed, bounds)
 
 
 def make_low_level(
-    config: TBCConfig,
-    ends: LevelSpaces,
-    seed: int,
-    bounds: ValueBounds | None,
-    views: LevelViews,
+    config: TBCConfig, views: LevelViews, actions: spaces.Box, seed: int, bounds: ValueBounds | None
 ) -> SACLevel:
-    """The level that executes subgoals; its actor is the circuit unless its ``policy_kwargs["ndbc"]`` is None."""
+    """The level that executes subgoals; its actor is the circuit unless its ``policy_kwargs["ndbc"]`` is None.
+
+    :param actions: the task's
+    """
     policy_kwargs = config.low.policy_kwargs.to_kwargs()
     circuit = policy_kwargs["ndbc"]
     if circuit is not None:
         if circuit["motor"] is None:
-            circuit["motor"] = ends.action.shape[0]
+            circuit["motor"] = actions.shape[0]
         if circuit["input_scale"] is None:
             circuit["input_scale"] = views.low_scale().tolist()
     if policy_kwargs["gru"] is not None:
         policy_kwargs["gru"] = {"hidden_size": policy_kwargs["gru"], "input_scale": views.low_scale().tolist()}
     if policy_kwargs["negative_critic"] is None:
         policy_kwargs["negative_critic"] = config.low_reward == "step"
-    return _make_level("low", config, config.low, ends, policy_kwargs, seed, bounds)
+    unit_actions = spaces.Box(-1.0, 1.0, actions.shape, np.float32)
+    return _make_level("low", config, config.low, views.low_space(), unit_actions, policy_kwargs, seed, bounds)
 
 
 def _make_level(
     name: str,
     config: TBCConfig,
     level: LevelConfig,
-    ends: LevelSpaces,
+    observations: spaces.Box,
+    actions: spaces.Box,
     policy_kwargs: Plain,
     seed: int,
     bounds: ValueBounds | None,
@@ -190,8 +185,8 @@ def _make_level(
     actor_rate = level.actor_learning_rate
     return SACLevel(
         LevelPolicy,
-        ends.observation,
-        ends.action,
+        observations,
+        actions,
         learning_rate=learning_rate_of(level.learning_rate),
         actor_learning_rate=None if actor_rate is None else learning_rate_of(actor_rate),
         ent_coef_learning_rate=level.ent_coef_learning_rate,
@@ -216,7 +211,6 @@ def _make_level(
 
 def make_high_buffer(
     config: TBCConfig,
-    ends: LevelSpaces,
     seed: int,
     high: SACLevel,
     views: LevelViews,
@@ -229,8 +223,8 @@ def make_high_buffer(
         teacher = DurationTeacher(ReachRule(views, rules, reachability, config.kappa), high)
     return OptionReplayBuffer(
         config.high.buffer_size,
-        ends.observation,
-        ends.action,
+        high.observation_space,
+        high.action_space,
         seed=seed,
         context=None if teacher is None else views.subgoals,
         teacher=teacher,
@@ -238,12 +232,7 @@ def make_high_buffer(
 
 
 def make_low_buffer(
-    config: TBCConfig,
-    ends: LevelSpaces,
-    seed: int,
-    low: SACLevel,
-    views: LevelViews,
-    reward: LowLevelReward,
+    config: TBCConfig, seed: int, low: SACLevel, views: LevelViews, reward: LowLevelReward
 ) -> SubgoalReplayBuffer:
     """Replay of the low level's steps, which draws their hindsight subgoals."""
     own = config.low
@@ -252,8 +241,8 @@ def make_low_buffer(
         strategy = "future"
     return SubgoalReplayBuffer(
         own.buffer_size,
-        ends.observation,
-        ends.action,
+        low.observation_space,
+        low.action_space,
         views=views,
         rules=reward.rules,
         state_dim=low.state_dim,

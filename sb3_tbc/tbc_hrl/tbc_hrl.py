@@ -28,7 +28,6 @@ from sb3_tbc.smdp.views import LevelViews
 from sb3_tbc.tbc_hrl import assembly, calls, resume
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
-from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
 from sb3_tbc.tbc_hrl.config import TBCConfig
 from sb3_tbc.tbc_hrl.diagnostics import (
@@ -191,29 +190,25 @@ class TBCHRL(TwoLevelSaving):
         self.views = assembly.make_views(config, subgoals, self.achieved_in_observation)
         self.high_reward = assembly.make_high_reward(config, self.rules)
         self.low_level_reward = LowLevelReward(config.low_reward, subgoals, self.rules)
-        high_spaces = LevelSpaces(self.views.high_space(space), self.views.high_action_space())
-        low_spaces = LevelSpaces(self.views.low_space(), spaces.Box(-1.0, 1.0, actions.shape, np.float32))
         high_bounds = assembly.make_high_bounds(config, self.high_reward, self.rules, self.reward_range)
         low_bounds = assembly.make_low_bounds(config, self.low_level_reward)
-        self.high = assembly.make_high_level(config, high_spaces, seeds[1], high_bounds)
-        self.low = assembly.make_low_level(config, low_spaces, seeds[2], low_bounds, self.views)
+        self.high = assembly.make_high_level(config, self.views, space, seeds[1], high_bounds)
+        self.low = assembly.make_low_level(config, self.views, actions, seeds[2], low_bounds)
         self.reachability = assembly.make_reachability(config, subgoals, self.rules, seeds[6])
         self.schedule = assembly.make_schedule(config, self.views, self.rules, self.reachability)
-        self._make_replay(high_spaces, low_spaces, seeds[3], seeds[4])
+        self._make_replay(seeds[3], seeds[4])
         self.policy = TBCPolicy(
             space, actions, self.high, self.low, self.views, self.rules, config.memory, seeds[5], self.schedule,
             config.reconsider_margin,
         )  # fmt: skip
         self.diagnostics = EpisodeDiagnostics()
 
-    def _make_replay(self, high_spaces: LevelSpaces, low_spaces: LevelSpaces, high_seed: int, low_seed: int) -> None:
+    def _make_replay(self, high_seed: int, low_seed: int) -> None:
         """Empty replay buffers for both levels, and what fills them."""
         config = self.config
         self.replay_buffer = Replay(
-            assembly.make_high_buffer(
-                config, high_spaces, high_seed, self.high, self.views, self.rules, self.reachability
-            ),
-            assembly.make_low_buffer(config, low_spaces, low_seed, self.low, self.views, self.low_level_reward),
+            assembly.make_high_buffer(config, high_seed, self.high, self.views, self.rules, self.reachability),
+            assembly.make_low_buffer(config, low_seed, self.low, self.views, self.low_level_reward),
         )
         self.high.replay_buffer, self.low.replay_buffer = self.replay_buffer  # type: ignore[assignment]
         self.store = EpisodeStore(

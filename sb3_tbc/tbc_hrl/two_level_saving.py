@@ -19,7 +19,6 @@ from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.settings import SettingError, plain
 from sb3_tbc.tbc_hrl import resume
-from sb3_tbc.tbc_hrl.assembly import LevelSpaces
 from sb3_tbc.tbc_hrl.calls import LEVEL_NAMES
 from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
@@ -48,7 +47,7 @@ class TwoLevelSaving(PlainAlgorithm):
     foreign_high: BaseAlgorithm | None = None
     """The algorithm that proposes options in the place of the high level, see :meth:`from_levels`."""
 
-    def _make_replay(self, high_spaces: LevelSpaces, low_spaces: LevelSpaces, high_seed: int, low_seed: int) -> None:
+    def _make_replay(self, high_seed: int, low_seed: int) -> None:
         """Empty replay buffers for both levels, and what fills them."""
         raise NotImplementedError
 
@@ -106,8 +105,7 @@ class TwoLevelSaving(PlainAlgorithm):
         :raises ValueError: if the file was written for other spaces or sizes
         """
         if getattr(self, "replay_buffer", None) is None:
-            high, low = map(LevelSpaces.of_level, (self.high, self.low))
-            self._make_replay(high, low, *self.rng.integers(2**31, size=2).tolist())
+            self._make_replay(*self.rng.integers(2**31, size=2).tolist())
         self._resumed = self.replay_buffer.load(path)
 
     @classmethod
