@@ -12,11 +12,13 @@ from sb3_tbc.smdp.hindsight import (
     GoalTest,
 )
 from sb3_tbc.smdp.options import Episode, Option, OptionRules, TerminationReason
+from sb3_tbc.smdp.rewards import LowLevelReward
 from sb3_tbc.smdp.views import LevelViews
 
 ENV = Corridor()
 RULES = OptionRules(dt_max=4.0, max_options=5)
 LAYOUT = LevelViews(ENV.subgoals, True)
+SPARSE = LowLevelReward("sparse", ENV.subgoals, RULES)
 GOALS = GoalTest(lambda a, d: ENV.compute_reward(a, d, {}), lambda a, d: ENV.compute_terminated(a, d, {}))
 
 

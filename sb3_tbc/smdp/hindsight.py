@@ -18,6 +18,7 @@ from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.options import Episode, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
+from sb3_tbc.smdp.views import LevelViews
 
 
 def check_goal_strategy(strategy: str, subgoals: SubgoalSpace | None) -> None:
@@ -59,28 +60,23 @@ class LowLevelSteps(NamedTuple):
     dones: NDArray[np.bool_]  # (T,) the window is over: no bootstrap
 
 
-def low_level_steps(
-    episode: Episode, subgoals: SubgoalSpace, rules: OptionRules, reward: LowLevelReward | None = None
-) -> LowLevelSteps:
+def low_level_steps(episode: Episode, reward: LowLevelReward) -> LowLevelSteps:
     """Ordinary transitions of the low level.
 
     A window that the end of the episode cuts off is not over for the low level: its last step bootstraps.
 
     :param episode: a finished one, of T steps
-    :param subgoals: the task's
-    :param rules: what ended its options
-    :param reward: by default 1 where the window ends with its subgoal reached, else 0
+    :param reward: the low level's
     """
-    reward = reward or LowLevelReward("sparse", subgoals, rules)
     lengths = np.array([option.duration for option in episode.options])
     position = np.concatenate([np.arange(n) for n in lengths])
     per_step = np.repeat(np.arange(len(lengths)), lengths)
     budget = np.array([option.time_budget for option in episode.options])[per_step]
     subgoal = np.stack([option.subgoal for option in episode.options])[per_step]
     seen = _rows(episode, np.arange(episode.length + 1))
-    local, points = subgoals.local(seen), subgoals.achieved(seen)
+    local, points = reward.subgoals.local(seen), reward.subgoals.achieved(seen)
     rewards, over = reward.rewards_and_ends(
-        points[:-1], points[1:], subgoal, position + 1 >= budget, may_end=position + 1 >= rules.dt_min
+        points[:-1], points[1:], subgoal, position + 1 >= budget, may_end=position + 1 >= reward.rules.dt_min
     )
     return LowLevelSteps(
         local=local[:-1],
@@ -226,12 +222,11 @@ def goal_pairs(
 
 def high_level_steps(
     episode: Episode,
-    subgoals: SubgoalSpace,
+    views: LevelViews,
     rules: OptionRules,
     reward: HighLevelReward,
     settings: HindsightSettings,
     goal_test: GoalTest,
-    high_view: Callable[[dict[str, FloatArray]], FloatArray],
     rng: np.random.Generator,
 ) -> HighLevelSteps:
     """All SMDP transitions that the high level learns from in one episode, in this order:
@@ -242,17 +237,16 @@ def high_level_steps(
     A test that the task's success cut off has not failed: its subgoal was not needed any more.
 
     :param episode: a finished one
-    :param subgoals: the task's
+    :param views: what the high level sees and chooses
     :param rules: what ended its options
     :param reward: the high level's
     :param settings: how much hindsight there is
     :param goal_test: the task's rewards and ends under other goals
-    :param high_view: maps goal observations to the high level's flat observation
     :param rng: draws goals and time budgets
     """
-    actions, changed = relabel_actions(episode, subgoals, rules, rng, settings.tolerance)
-    options = _Options(episode, subgoals, actions, changed)
-    source = _TransitionSource(options, rules, reward, high_view, episode)
+    actions, changed = relabel_actions(episode, views.subgoals, rules, rng, settings.tolerance)
+    options = _Options(episode, views.subgoals, actions, changed)
+    source = _TransitionSource(options, views, rules, reward, episode)
     parts = [source.failed_tests(settings.testing_penalty)]
     if settings.keep_original:
         parts.append(source.as_chosen())
@@ -289,20 +283,12 @@ class _Options:
 
 
 class _TransitionSource:
-    """Makes the high level's transitions of an episode from its options.
-
-    :param high_view: maps goal observations to the high level's flat observation
-    """
+    """Makes the high level's transitions of an episode from its options."""
 
     def __init__(
-        self,
-        options: _Options,
-        rules: OptionRules,
-        reward: HighLevelReward,
-        high_view: Callable[[dict[str, FloatArray]], FloatArray],
-        episode: Episode,
+        self, options: _Options, views: LevelViews, rules: OptionRules, reward: HighLevelReward, episode: Episode
     ) -> None:
-        self.options, self.rules, self.reward, self.high_view, self.episode = options, rules, reward, high_view, episode
+        self.options, self.views, self.rules, self.reward, self.episode = options, views, rules, reward, episode
         self.rewards = reward.window_rewards(episode.rewards, options.starts, options.durations)
         self.bonus = reward.completion_bonus * (options.reached | options.changed)
 
@@ -358,7 +344,7 @@ class _TransitionSource:
         if goals is not None:
             old["desired_goal"] = new["desired_goal"] = goals
         return HighLevelSteps(
-            self.high_view(old), actions, rewards, self.high_view(new), dones, self.reward.discounts(durations),
+            self.views.high(old), actions, rewards, self.views.high(new), dones, self.reward.discounts(durations),
             o.changed[rows] & relabelled, durations, o.local[rows], o.here[rows],
         )  # fmt: skip
 

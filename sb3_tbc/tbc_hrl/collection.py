@@ -195,11 +195,8 @@ class EpisodeStore:
 
     def add(self, episode: Episode, goal_test: GoalTest) -> HighLevelSteps:
         """Store an episode; what the high level learns from it."""
-        subgoals = self.views.subgoals
         self._compare(goal_test, episode.achieved_goal[1:], episode.desired_goal[1:], episode.rewards)
-        self.replay.low.extend(low_level_steps(episode, subgoals, self.rules, self.low_reward))
-        steps = high_level_steps(
-            episode, subgoals, self.rules, self.reward, self.hindsight, goal_test, self.views.high, self.rng
-        )
+        self.replay.low.extend(low_level_steps(episode, self.low_reward))
+        steps = high_level_steps(episode, self.views, self.rules, self.reward, self.hindsight, goal_test, self.rng)
         self.replay.high.extend(steps)
         return steps

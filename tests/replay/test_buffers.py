@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from two_windows import ENV, GOALS, LAYOUT, RULES, episode, low_buffer
+from two_windows import ENV, GOALS, LAYOUT, RULES, SPARSE, episode, low_buffer
 
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.smdp.hindsight import (
@@ -18,7 +18,7 @@ from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 
 def test_relabelled_low_level_samples_are_consistent() -> None:
     buffer = low_buffer(100, hindsight=1e9)
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    buffer.extend(low_level_steps(episode(), SPARSE))
     batch = buffer.sample_burst(1, 2000)
     observations, rewards = batch.observations[0].numpy(), batch.rewards[0, :, 0].numpy()
     position, subgoal, left = observations[:, 0], observations[:, 3], observations[:, 4] * RULES.dt_max
@@ -41,7 +41,9 @@ def test_relabelled_windows_do_not_end_before_dt_min(kind: str) -> None:
     rules = OptionRules(dt_max=4.0, dt_min=2.0, max_options=5, window_end="reached")
     still = episode()._replace(observation=np.stack([np.zeros(6), np.arange(6.0), np.ones(6)], axis=1))
     buffer = low_buffer(100, hindsight=1e9, rules=rules, reward=LowLevelReward(kind, ENV.subgoals, rules))
-    buffer.extend(low_level_steps(still._replace(achieved_goal=np.zeros((6, 1))), ENV.subgoals, rules))
+    buffer.extend(
+        low_level_steps(still._replace(achieved_goal=np.zeros((6, 1))), LowLevelReward("sparse", ENV.subgoals, rules))
+    )
     batch = buffer.sample_burst(1, 500)
     step, left = batch.observations[0, :, 1].numpy(), batch.observations[0, :, 4].numpy() * rules.dt_max
     within = np.where(step < 3, step, step - 3)  # steps since the window began
@@ -54,7 +56,7 @@ def test_relabelled_windows_do_not_end_before_dt_min(kind: str) -> None:
 def test_relabelled_remaining_time_is_whole_where_budgets_are() -> None:
     rules = OptionRules(dt_max=4.0, max_options=5, whole_budgets=True)
     buffer = low_buffer(100, hindsight=1e9, rules=rules)
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, rules))
+    buffer.extend(low_level_steps(episode(), LowLevelReward("sparse", ENV.subgoals, rules)))
     observations = buffer.sample_burst(1, 500).observations[0].numpy()
     position, subgoal, left = observations[:, 0], observations[:, 3], observations[:, 4] * rules.dt_max
     np.testing.assert_allclose(left, np.rint((subgoal - position) / 0.1), atol=1e-5)
@@ -62,7 +64,7 @@ def test_relabelled_remaining_time_is_whole_where_budgets_are() -> None:
 
 def test_plain_low_level_samples_are_what_was_stored() -> None:
     buffer = low_buffer(100, hindsight=0)
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    buffer.extend(low_level_steps(episode(), SPARSE))
     batch = buffer.sample_burst(2, 50)
     assert batch.observations.shape == (2, 50, 5)
     assert np.round(batch.observations[..., 3].unique().numpy(), 5).tolist() == pytest.approx([0.5, 0.9])
@@ -73,7 +75,7 @@ def test_plain_low_level_samples_are_what_was_stored() -> None:
 def test_ring_never_mixes_windows_after_wrapping() -> None:
     buffer = low_buffer(13, hindsight=1e9)  # 5 rows at a time: windows get cut by the write position
     for _ in range(7):
-        buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+        buffer.extend(low_level_steps(episode(), SPARSE))
         batch = buffer.sample_burst(1, 500)
         position, subgoal = batch.observations[0, :, 0].numpy(), batch.observations[0, :, 3].numpy()
         untouched = np.isclose(subgoal, 0.9) | (np.isclose(subgoal, 0.5) & (position > 0.25))
@@ -84,7 +86,7 @@ def test_ring_never_mixes_windows_after_wrapping() -> None:
 
 def test_a_full_ring_relabels_its_newest_window_too() -> None:
     buffer = low_buffer(10, hindsight=1e9)  # two episodes fit to the row
-    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    steps = low_level_steps(episode(), SPARSE)
     for _ in range(3):
         buffer.extend(steps._replace(subgoal=np.full_like(steps.subgoal, 0.9)))
     assert buffer.sample_burst(1, 500).observations[..., 3].max() < 0.65  # 0.9 was asked for, 0.5 reached at most
@@ -94,9 +96,7 @@ def test_option_buffer_gives_sb3_samples_with_discounts() -> None:
     buffer = OptionReplayBuffer(50, LAYOUT.high_space(ENV.observation_space), LAYOUT.high_action_space(), seed=0)
     reward = HighLevelReward("smdp", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
     settings = HindsightSettings(0, "future", -5.0, keep_original=True)
-    buffer.extend(
-        high_level_steps(episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
-    )
+    buffer.extend(high_level_steps(episode(), LAYOUT, RULES, reward, settings, GOALS, np.random.default_rng(0)))
     sample = buffer.sample(64)
     np.testing.assert_allclose(sample.discounts.unique().numpy(), [0.9**1.5, 0.9], rtol=1e-6)
     with pytest.raises(TypeError, match="extend"):
@@ -106,7 +106,7 @@ def test_option_buffer_gives_sb3_samples_with_discounts() -> None:
 def test_buffer_state_round_trip_and_mismatch() -> None:
     buffer, other = low_buffer(13, 3), low_buffer(13, 3)
     for _ in range(3):
-        buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+        buffer.extend(low_level_steps(episode(), SPARSE))
     other.set_state({k: v.copy() for k, v in buffer.get_state().items()})
     assert (other.pos, other.full) == (buffer.pos, buffer.full)
     for name in buffer.data:
@@ -116,12 +116,12 @@ def test_buffer_state_round_trip_and_mismatch() -> None:
     with pytest.raises(ValueError, match="subgoal has width 1"):
         other.set_state(state)
     with pytest.raises(ValueError, match="does not fit"):
-        low_buffer(3, 1).extend(low_level_steps(episode(), ENV.subgoals, RULES))
+        low_buffer(3, 1).extend(low_level_steps(episode(), SPARSE))
 
 
 def test_rows_that_just_fill_a_smaller_buffer_stay() -> None:
     old, new = low_buffer(13, 3), low_buffer(5, 3)
-    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    steps = low_level_steps(episode(), SPARSE)
     assert steps.local.shape[0] == 5
     old.extend(steps)
     new.set_state(old.get_state())
@@ -132,7 +132,7 @@ def test_rows_that_just_fill_a_smaller_buffer_stay() -> None:
 def test_a_full_ring_goes_on_in_a_larger_one(more: int) -> None:
     """Episodes are told apart by their serial number; what was sampled of a window belongs to it."""
     old, new = (low_buffer(size, 1e9, sequence_length=3, reach_pairs=True) for size in (13, 13 + more))
-    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    steps = low_level_steps(episode(), SPARSE)
     marked = [steps._replace(local=steps.local * 0 + n, states=steps.states * 0 + n) for n in range(1, 8)]
     for part in marked[:6]:
         old.extend(part)
@@ -152,7 +152,7 @@ def test_a_full_ring_goes_on_in_a_larger_one(more: int) -> None:
 
 def test_dense_reward_of_relabelled_steps() -> None:
     buffer = low_buffer(100, 1e9, reward=LowLevelReward("dense", ENV.subgoals, RULES))
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    buffer.extend(low_level_steps(episode(), SPARSE))
     batch = buffer.sample_burst(1, 500)
     ahead = np.rint((batch.observations[0, :, 3] - batch.observations[0, :, 0]).numpy() / 0.1)
     np.testing.assert_allclose(batch.rewards[0, :, 0].numpy(), 0.05 + (ahead == 1), atol=1e-6)
@@ -165,7 +165,7 @@ def test_untimed_goals_come_from_the_same_window(strategy: str) -> None:
     buffer = SubgoalReplayBuffer(
         100, layout.low_space(), ENV.action_space, layout, RULES, 2, 0.99, 3, seed=0, reward=reward, hindsight=strategy
     )
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES, reward))
+    buffer.extend(low_level_steps(episode(), reward))
     batch = buffer.sample_burst(1, 20_000)
     assert batch.observations.shape == (1, 20_000, 4)  # position, steps, serial, subgoal: no time
     row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
@@ -190,7 +190,7 @@ def test_untimed_goals_come_from_the_same_window(strategy: str) -> None:
 
 def test_samples_hold_the_steps_before_them_of_their_window() -> None:
     buffer = low_buffer(100, hindsight=0, sequence_length=3)
-    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    steps = low_level_steps(episode(), SPARSE)
     buffer.extend(steps._replace(states=np.arange(5.0)[:, None] * np.ones((5, 2))))
     batch = buffer.sample_burst(1, 200)
     observations, earlier = batch.observations[0].numpy(), batch.earlier[0].view(200, 2, 1 + 5).numpy()
@@ -206,7 +206,7 @@ def test_samples_hold_the_steps_before_them_of_their_window() -> None:
 
 def test_memory_begins_where_the_steps_do() -> None:
     buffer = low_buffer(100, hindsight=0, sequence_length=2)
-    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    steps = low_level_steps(episode(), SPARSE)
     buffer.extend(steps._replace(states=np.arange(5.0)[:, None] * np.ones((5, 2))))
     batch = buffer.sample_burst(1, 200)
     row = np.rint(batch.observations[0, :, 0].numpy() / 0.1).astype(int)
@@ -215,7 +215,7 @@ def test_memory_begins_where_the_steps_do() -> None:
 
 def test_without_earlier_steps_the_stored_states_are_sampled() -> None:
     buffer = low_buffer(100, hindsight=0)
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    buffer.extend(low_level_steps(episode(), SPARSE))
     batch = buffer.sample_burst(1, 50)
     assert set(batch.states.unique().tolist()) == {0.0}
     assert set(batch.next_states.unique().tolist()) == {1.0}
@@ -224,7 +224,7 @@ def test_without_earlier_steps_the_stored_states_are_sampled() -> None:
 
 def test_earlier_steps_have_the_sampled_subgoal_and_its_time() -> None:
     buffer = low_buffer(100, hindsight=1e9, sequence_length=2)
-    buffer.extend(low_level_steps(episode(), ENV.subgoals, RULES))
+    buffer.extend(low_level_steps(episode(), SPARSE))
     batch = buffer.sample_burst(1, 500)
     observations, earlier = batch.observations[0].numpy(), batch.earlier[0].numpy()
     known = earlier[:, 0] == 1

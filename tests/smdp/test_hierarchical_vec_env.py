@@ -17,7 +17,7 @@ from sb3_tbc.errors import HierarchyError
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 from sb3_tbc.smdp.hindsight import low_level_steps
 from sb3_tbc.smdp.options import OptionRules, TerminationReason
-from sb3_tbc.smdp.rewards import HighLevelReward, discounted_sums
+from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward, discounted_sums
 from sb3_tbc.smdp.views import LevelViews
 
 
@@ -205,7 +205,7 @@ def test_a_subgoal_reached_as_the_task_succeeds_counts_as_reached() -> None:
     assert episode.terminated
     assert option.reached
     assert option.reason is TerminationReason.REACHED
-    low = low_level_steps(episode, space, env.rules)
+    low = low_level_steps(episode, LowLevelReward("sparse", space, env.rules))
     assert low.rewards[-1] == 1.0
 
 
@@ -215,7 +215,7 @@ def test_both_levels_agree_on_what_was_reached(seed: int, window_end: str, dt_mi
     env = make(2, seed, limit=25, window_end=window_end, dt_min=dt_min)
     episodes, _, _ = run(env, 150, seed)
     for episode in episodes:
-        low = low_level_steps(episode, env.views.subgoals, env.rules)
+        low = low_level_steps(episode, LowLevelReward("sparse", env.views.subgoals, env.rules))
         ends = [option.start + option.duration - 1 for option in episode.options]
         assert [bool(low.rewards[end]) for end in ends] == [option.reached for option in episode.options]
         cut = [o.reason in (TerminationReason.EPISODE_END, TerminationReason.EVENT) for o in episode.options]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from two_windows import ENV, GOALS, LAYOUT, RULES, episode, option
+from two_windows import ENV, GOALS, LAYOUT, RULES, SPARSE, episode, option
 
 from sb3_tbc.smdp.hindsight import (
     HighLevelSteps,
@@ -24,7 +24,7 @@ from sb3_tbc.smdp.spaces import SubgoalSpace
 
 
 def test_low_level_transitions_of_two_windows() -> None:
-    steps = low_level_steps(episode(), ENV.subgoals, RULES)
+    steps = low_level_steps(episode(), SPARSE)
     np.testing.assert_array_equal(steps.position, [0, 1, 2, 0, 1])
     np.testing.assert_array_equal(steps.length, [3, 3, 3, 2, 2])
     np.testing.assert_array_equal(steps.time_left, [2.5, 1.5, 0.5, 1.5, 0.5])
@@ -37,7 +37,7 @@ def test_low_level_transitions_of_two_windows() -> None:
 
 def test_window_cut_by_the_episode_is_not_over_for_the_low_level() -> None:
     cut = episode()._replace(options=(option(0, 3, 0.9, 2.5, True, False), option(3, 2, -0.5, 3.5, False, False)))
-    assert not low_level_steps(cut, ENV.subgoals, RULES).dones[-1]
+    assert not low_level_steps(cut, SPARSE).dones[-1]
 
 
 def test_failed_option_becomes_the_one_that_was_achieved() -> None:
@@ -81,9 +81,7 @@ def test_where_windows_meet_hindsight_goals_is_a_setting(goals_met: str, met: in
     wandering = episode()._replace(observation=rows, achieved_goal=there_and_on[:, None], desired_goal=np.ones((6, 1)))
     reward = HighLevelReward("smdp", 1.0, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
     settings = HindsightSettings(1, "future", -5.0, keep_original=False, goals_met=goals_met)
-    steps = high_level_steps(
-        wandering, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0)
-    )
+    steps = high_level_steps(wandering, LAYOUT, RULES, reward, settings, GOALS, np.random.default_rng(0))
     assert steps.dones[-1] == met
     assert steps.durations[-1] == (1 if met else 3)
 
@@ -91,9 +89,7 @@ def test_where_windows_meet_hindsight_goals_is_a_setting(goals_met: str, met: in
 def test_all_high_level_transitions_by_hand() -> None:
     reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=2.0)
     settings = HindsightSettings(n_goals=1, goal_strategy="future", testing_penalty=-5.0, keep_original=False)
-    steps = high_level_steps(
-        episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0)
-    )
+    steps = high_level_steps(episode(), LAYOUT, RULES, reward, settings, GOALS, np.random.default_rng(0))
     # failed test, two hindsight actions, one goal copy (the first option with the second's outcome)
     assert len(steps.rewards) == 4
     assert steps.rewards[0] == -5.0
@@ -109,7 +105,7 @@ def test_all_high_level_transitions_by_hand() -> None:
 def high_steps(of: Episode, duration_cost: float = 0.0, keep_original: bool = False) -> HighLevelSteps:
     reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=duration_cost)
     settings = HindsightSettings(0, "future", -5.0, keep_original=keep_original)
-    return high_level_steps(of, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
+    return high_level_steps(of, LAYOUT, RULES, reward, settings, GOALS, np.random.default_rng(0))
 
 
 def test_a_reached_test_is_not_punished() -> None:
@@ -164,7 +160,7 @@ def test_whole_budgets_are_rounded_and_last_as_long_as_they_say() -> None:
 
 
 def test_dense_reward_adds_up_to_how_much_nearer_the_window_came() -> None:
-    steps = low_level_steps(episode(), ENV.subgoals, RULES, LowLevelReward("dense", ENV.subgoals, RULES))
+    steps = low_level_steps(episode(), LowLevelReward("dense", ENV.subgoals, RULES))
     # a step of 0.1 toward the subgoal is 0.05 of the bounds' width; the last one also reaches it in time
     np.testing.assert_allclose(steps.rewards, [0.05, 0.05, 0.05, 0.05, 1.05], atol=1e-6)
     np.testing.assert_array_equal(steps.dones, [False, False, True, False, True])
@@ -175,7 +171,7 @@ def test_dense_reward_adds_up_to_how_much_nearer_the_window_came() -> None:
 
 
 def test_per_step_reward_ends_where_the_subgoal_is_reached_and_only_there() -> None:
-    steps = low_level_steps(episode(), ENV.subgoals, RULES, LowLevelReward("step", ENV.subgoals, RULES))
+    steps = low_level_steps(episode(), LowLevelReward("step", ENV.subgoals, RULES))
     np.testing.assert_array_equal(steps.rewards, [-1, -1, -1, -1, 0])
     np.testing.assert_array_equal(steps.dones, [False, False, False, False, True])  # running out of time is no end
 
@@ -190,7 +186,7 @@ def test_hindsight_options_must_end_within_the_tolerance(end: float, relabelled:
     assert actions[0, 0] == pytest.approx(1.0 if relabelled else 0.9)
     reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0)
     settings = HindsightSettings(0, "future", -5.0, keep_original=False, tolerance=0.05)
-    steps = high_level_steps(moved, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
+    steps = high_level_steps(moved, LAYOUT, RULES, reward, settings, GOALS, np.random.default_rng(0))
     # the failed test is penalised; without a hindsight action it is not also stored as if nothing had been wrong
     assert steps.rewards.tolist() == ([-5.0, -1.0, 0.0] if relabelled else [-5.0, 0.0])
 
@@ -207,7 +203,7 @@ def test_originals_are_kept_beside_their_hindsight_copies() -> None:
     )
     settings = HindsightSettings(0, "future", -5.0, keep_original=True)
     steps = high_level_steps(
-        episode()._replace(options=options), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high,
+        episode()._replace(options=options), LAYOUT, RULES, reward, settings, GOALS,
         np.random.default_rng(0),
     )  # fmt: skip
     np.testing.assert_allclose(steps.actions[:, 0], [0.9, 0.3, 0.5])  # as chosen, as it turned out, as it was reached
@@ -238,7 +234,9 @@ def test_goals_of_an_event() -> None:
     settings = HindsightSettings(3, "event", -5.0, keep_original=False)
 
     def steps(of: Episode) -> HighLevelSteps:
-        return high_level_steps(of, subgoals, RULES, reward, settings, GOALS, LAYOUT.high, np.random.default_rng(0))
+        return high_level_steps(
+            of, LAYOUT._replace(subgoals=subgoals), RULES, reward, settings, GOALS, np.random.default_rng(0)
+        )
 
     happened = steps(episode()._replace(observation=flags))
     np.testing.assert_allclose(happened.observations[-2:, 0], 0.3)  # both get the goal that the first option met
@@ -256,7 +254,7 @@ def test_a_failure_ends_with_any_goal(goals_met: str, terminated: bool, success:
     reward = HighLevelReward("smdp", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=1.0, duration_cost=0.0)
     settings = HindsightSettings(40, "episode", -5.0, keep_original=False, goals_met=goals_met)
     of, rng = episode()._replace(terminated=terminated, success=success), np.random.default_rng(0)
-    steps = high_level_steps(of, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, rng)
+    steps = high_level_steps(of, LAYOUT, RULES, reward, settings, GOALS, rng)
     copies = np.arange(len(steps.dones)) > 2  # behind a failed test and the two options
     elsewhere = copies & np.isclose(steps.observations[:, 0], 0.3)  # a goal that only the first option met
     last = np.isclose(steps.observations[:, 1], 0.3)
@@ -273,7 +271,7 @@ def test_decisions_meet_hindsight_goals_at_their_end() -> None:
     reward = HighLevelReward("decision", 0.9, dt_ref=2.0, dt_max=4.0, decision_cost=0.0, duration_cost=0.0)
     settings = HindsightSettings(1, "future", -5.0, keep_original=False, goals_met="passing")
     rng = np.random.default_rng(0)
-    steps = high_level_steps(wandering, ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, rng)
+    steps = high_level_steps(wandering, LAYOUT, RULES, reward, settings, GOALS, rng)
     assert not steps.dones[-1]
     assert steps.durations[-1] == 3
 
@@ -284,7 +282,7 @@ def test_copies_with_hindsight_goals_have_the_bonus_and_keep_their_types() -> No
     )
     settings = HindsightSettings(1, "future", -5.0, keep_original=False)
     rng = np.random.default_rng(0)
-    steps = high_level_steps(episode(), ENV.subgoals, RULES, reward, settings, GOALS, LAYOUT.high, rng)
+    steps = high_level_steps(episode(), LAYOUT, RULES, reward, settings, GOALS, rng)
     assert steps.rewards[-1] == pytest.approx(-3 / 2 - 1 + 0.25)  # three steps to 0.3, on the way to 0.5
     assert steps.dones.dtype == bool
     assert np.issubdtype(steps.durations.dtype, np.integer)

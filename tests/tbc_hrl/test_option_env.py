@@ -163,8 +163,8 @@ def test_it_pays_what_the_agent_learns_from(duration: str) -> None:
     (episode,) = runner.run(1, lambda episode: episode)
     no_hindsight = HindsightSettings(0, "future", -10.0, True, tolerance=-1.0)
     learnt = high_level_steps(
-        episode, agent.subgoals, agent.rules, agent.high_reward, no_hindsight, runner.env.judge.goal_test,
-        agent.views.high, np.random.default_rng(0),
+        episode, agent.views, agent.rules, agent.high_reward, no_hindsight, runner.env.judge.goal_test,
+        np.random.default_rng(0),
     ).rewards  # fmt: skip
     env = OptionEnv(DummyVecEnv([lambda: Corridor(goal=0.99)]), agent)
     env.seed(3)

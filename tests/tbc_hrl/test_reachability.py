@@ -17,12 +17,14 @@ from two_windows import LAYOUT, low_buffer
 from sb3_tbc import TBCHRL
 from sb3_tbc.smdp.hindsight import low_level_steps
 from sb3_tbc.smdp.options import Episode, Option, OptionRules, TerminationReason
+from sb3_tbc.smdp.rewards import LowLevelReward
 from sb3_tbc.tbc_hrl.evaluation import evaluate_hierarchical
 from sb3_tbc.tbc_hrl.reachability import UPDATE_EVERY, Reachability
 from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
 
 ENV = Corridor()
 RULES = OptionRules(dt_max=20.0, dt_min=2.0, max_options=5)
+SPARSE = LowLevelReward("sparse", ENV.subgoals, RULES)
 LEVEL: dict[str, Any] = {"batch_size": 16, "policy_kwargs": {"net_arch": [8, 8]}}
 
 
@@ -66,7 +68,7 @@ def pair_buffer(size: int = 10_000, episodes: int = 30) -> Any:
     buffer = low_buffer(size, hindsight=3, reach_pairs=True)
     rng = np.random.default_rng(0)
     for _ in range(episodes):
-        buffer.extend(low_level_steps(wandering(rng), ENV.subgoals, RULES))
+        buffer.extend(low_level_steps(wandering(rng), SPARSE))
     return buffer
 
 
@@ -91,7 +93,7 @@ def test_a_point_passed_twice_is_as_far_as_the_first_time() -> None:
     back = wandering(np.random.default_rng(0), steps=18)
     back.achieved_goal[:] = there[:, None]
     buffer = low_buffer(100, hindsight=3, reach_pairs=True)
-    buffer.extend(low_level_steps(back, ENV.subgoals, RULES))
+    buffer.extend(low_level_steps(back, SPARSE))
     pairs = buffer.sample_pairs(2000, 40, np.random.default_rng(0))
     outward = (pairs.here[:, 0] < 0.05) & (pairs.goal[:, 0] > 0.05)
     np.testing.assert_allclose(pairs.steps[outward], pairs.goal[outward, 0] / 0.1, atol=1e-3)
