@@ -327,7 +327,7 @@ class _TransitionSource:
 
     def _charged(self, rewards: FloatArray, actions: FloatArray) -> FloatArray:
         """Rewards less the price of the time budgets in ``actions``."""
-        return rewards - self.reward.duration_cost * self.rules.budget(actions[:, -1]) / self.rules.dt_max
+        return rewards - self.reward.price(self.rules.budget(actions[:, -1]))
 
     def _steps(
         self,

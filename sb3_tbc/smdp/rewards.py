@@ -110,6 +110,10 @@ class HighLevelReward:
             return np.asarray(step_rewards[starts + durations - 1], dtype=np.float64)
         return discounted_sums(step_rewards, starts, durations, self.gamma_step) / self.dt_ref - self.decision_cost
 
+    def price(self, time_budgets: FloatArray) -> FloatArray:
+        """What time budgets in steps cost, ``(n,)``: the duration cost."""
+        return np.asarray(self.duration_cost * time_budgets / self.dt_max)
+
     def discounts(self, durations: NDArray[np.int64]) -> FloatArray:
         """Factor of the next state's value for windows of these lengths, ``(n,)``."""
         if self.target == "decision":

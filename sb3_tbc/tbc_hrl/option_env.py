@@ -187,7 +187,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         info["option"] = self.clock.close(index, int(duration[0]), reached, over).as_info()
         info["discount"] = float(reward.discounts(duration)[0])
         value = reward.window_rewards(np.array(rewards), np.array([0]), duration)[0]
-        value -= reward.duration_cost * self.clock.time_budget[index] / self.policy.rules.dt_max
+        value -= reward.price(self.clock.time_budget[index])
         used_up = self.clock.used[index] >= self.policy.rules.max_options
         if over or used_up:
             info["TimeLimit.truncated"] = bool(info["TimeLimit.truncated"] or not over)
