@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from sb3_tbc.arrays import AnyArray, FloatArray
+from sb3_tbc.arrays import AnyArray
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.spaces import GoalObservation
 
@@ -20,17 +20,15 @@ def all_finite(*arrays: AnyArray) -> bool:
     return math.isfinite(squares) or all(bool(np.isfinite(array).all()) for array in arrays)
 
 
-def not_finite(index: int, seen: GoalObservation, rewards: FloatArray | None = None) -> str | None:
+def not_finite(seen: GoalObservation, reward: float = 0.0) -> str | None:
     """What is not finite in one environment; None if all is.
 
-    :param index: of the environment
-    :param seen: what the environments show, one row each
-    :param rewards: what they paid, ``(n_envs,)``
+    :param seen: what it shows
+    :param reward: what it paid
     """
     for key in GOAL_KEYS:
-        if not np.isfinite(seen[key][index]).all():
-            return f"observation[{key!r}] is not finite: {seen[key][index].tolist()}"
-    reward = 0.0 if rewards is None else float(rewards[index])
+        if not np.isfinite(seen[key]).all():
+            return f"observation[{key!r}] is not finite: {np.asarray(seen[key]).tolist()}"
     return None if math.isfinite(reward) else f"its reward is {reward}"
 
 

@@ -124,10 +124,12 @@ class Guard:
 
     def _any_bad(self, infos: list[Plain]) -> bool:
         """Whether an environment's limit found something wrong with its step, or it is not in the agent's episode."""
-        for info, expected in zip(infos, self._resets, strict=True):  # a generator costs more
-            if BAD_STEP in info or (expected is not None and info.get(RESETS, expected) != expected):
-                return True
-        return False
+        return any(BAD_STEP in info or self._begun_elsewhere(index, info) for index, info in enumerate(infos))
+
+    def _begun_elsewhere(self, index: int, info: Plain) -> bool:
+        """Whether a step was one of an episode that someone else has begun."""
+        expected = self._resets[index]
+        return expected is not None and info.get(RESETS, expected) != expected
 
     def _note_resets(self, where: BoolArray) -> None:
         """Remember which episodes have begun, so that those that someone else begins are told from them."""
@@ -141,8 +143,9 @@ class Guard:
         told = {index: info[BAD_STEP] for index, info in enumerate(reset_infos) if info and BAD_STEP in info}
         if not told and all_finite(*(observation[key] for key in GOAL_KEYS)):
             return
-        for index in np.flatnonzero(where):
-            _raise(int(index), 0, told.get(int(index)), observation, None, "A reset cannot be skipped")
+        for index in map(int, np.flatnonzero(where)):
+            info = {BAD_STEP: told[index]} if index in told else {}
+            refuse_reset(index, {key: observation[key][index] for key in GOAL_KEYS}, info)
 
     def _end_bad(
         self, observation: Plain, rewards: Any, dones: Any, infos: list[Plain], seen: Plain, steps: AnyArray
@@ -151,13 +154,12 @@ class Guard:
         bad = self._none_bad.copy()
         for index in range(self.venv.num_envs):
             step, told = int(steps[index]) + 1, infos[index].get(BAD_STEP)
-            expected = self._resets[index]
-            elsewhere = expected is not None and infos[index].get(RESETS, expected) != expected
-            what = USED_ELSEWHERE if elsewhere else told or not_finite(index, seen, rewards)
+            elsewhere, row = self._begun_elsewhere(index, infos[index]), {key: seen[key][index] for key in GOAL_KEYS}
+            what = USED_ELSEWHERE if elsewhere else told or not_finite(row, float(rewards[index]))
             if what is None:
                 continue
             if not elsewhere:
-                self._stop_or_count(index, step, told, seen, rewards)
+                self._stop_or_count(index, step, what, EnvironmentFault if told else NonFiniteError)
             elif not self._can_begin_one():
                 raise EnvironmentFault(f"{place(index, step)}: {what}")
             self._tell(f"{place(index, step)}: {what}")
@@ -180,12 +182,10 @@ class Guard:
                             BAD_STEP: what}  # fmt: skip
         return bad
 
-    def _stop_or_count(
-        self, index: int, step: int, told: str | None, seen: GoalObservation, rewards: FloatArray
-    ) -> None:
+    def _stop_or_count(self, index: int, step: int, what: str, kind: type[Exception]) -> None:
         self._in_a_row[index] = self._in_a_row[index] + 1 if step == 1 else 0
         if self.on_bad_step == "stop" or self._in_a_row[index] > MOST_IN_A_ROW:
-            _raise(index, step, told, seen, rewards, "The step was not stored: look into the environment")
+            raise kind(f"{place(index, step)}: {what}. The step was not stored: look into the environment")
 
     def _tell(self, what: str) -> None:
         self.count += 1
@@ -203,26 +203,10 @@ def refuse_reset(index: int, fresh: GoalObservation, info: Plain) -> None:
     :raises EnvironmentFault: if a value has another shape than it should
     :raises NonFiniteError: if one is not finite
     """
-    what = info.get(BAD_STEP) or not_finite(0, {key: np.asarray(fresh[key])[None] for key in GOAL_KEYS})
+    what = info.get(BAD_STEP) or not_finite(fresh)
     if what is not None:
         kind = EnvironmentFault if BAD_STEP in info else NonFiniteError
         raise kind(f"{place(index, 0)}: {what}. A reset cannot be skipped")
-
-
-def _raise(
-    index: int, step: int, told: str | None, seen: GoalObservation, rewards: FloatArray | None, then: str
-) -> None:
-    """Raise for what is wrong with one environment, if anything is.
-
-    :param told: what its episode limit says is wrong; None if that found nothing
-    :raises EnvironmentFault: for what it said
-    :raises NonFiniteError: for what is not finite
-    """
-    if told is not None:
-        raise EnvironmentFault(f"{place(index, step)}: {told}. {then}")
-    what = not_finite(index, seen, rewards)
-    if what is not None:
-        raise NonFiniteError(f"{place(index, step)}: {what}. {then}")
 
 
 def before_reset(observation: GoalObservation, dones: BoolArray, infos: list[Plain]) -> GoalObservation:

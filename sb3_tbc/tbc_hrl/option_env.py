@@ -176,7 +176,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         step = int(self.clock.elapsed[index]) + 1
         if BAD_STEP in info:
             raise EnvironmentFault(f"environment {index}, step {step} of its option: {info[BAD_STEP]}")
-        wrong = not_finite(index, self._seen) or (None if math.isfinite(reward) else f"its reward is {reward}")
+        wrong = not_finite({key: self._seen[key][index] for key in GOAL_KEYS}, reward)
         if wrong is not None:
             raise NonFiniteError(f"environment {index}, step {step} of its option: {wrong}")
 
