@@ -212,6 +212,12 @@ def _write_partial(call: partial[object]) -> Plain:
     return {"call": encode(call.func), "arguments": encode(list(call.args)), "named": encode(dict(call.keywords))}
 
 
+def _read_partial(call: object, arguments: list[object], named: Plain) -> partial[object]:
+    if not isinstance(call, FunctionType) or not call.__module__.startswith("sb3_tbc.tasks."):
+        raise NotPlainError("only functions of tasks can have arguments filled in")
+    return partial(call, *arguments, **named)
+
+
 def _read_schedule(name: str, fields: Plain) -> object:
     kind = next((kind for kind in SCHEDULES if kind.__name__ == name), None)
     if kind is None:
@@ -261,18 +267,12 @@ READERS: dict[str, Callable[..., object]] = {
     "train_freq": TrainFreq,
     "tuple": lambda items: tuple(items),
     "deque": lambda items, longest: deque(items, maxlen=longest),
-    "ordered": lambda pairs: OrderedDict((key, item) for key, item in pairs),
-    "pairs": lambda pairs: {key: item for key, item in pairs},
+    "ordered": lambda pairs: OrderedDict(pairs),
+    "pairs": lambda pairs: dict(pairs),
     "slice": lambda ends: slice(*ends),
     "schedule": _read_schedule,
-    "partial": lambda call, arguments, named: _read_partial(call, arguments, named),
-    "function": lambda name: _function(name),
-    "class": lambda name: _class(name),
+    "partial": _read_partial,
+    "function": _function,
+    "class": _class,
     "object": _object,
 }
-
-
-def _read_partial(call: object, arguments: list[object], named: Plain) -> partial[object]:
-    if not isinstance(call, FunctionType) or not call.__module__.startswith("sb3_tbc.tasks."):
-        raise NotPlainError("only functions of tasks can have arguments filled in")
-    return partial(call, *arguments, **named)
