@@ -55,7 +55,7 @@ def trained_look(model: TBCHRL, seed: int = 0) -> TBCHRL:
                     p[::2] = -13.8  # a capacitance of 1e-6
                 if name.endswith("raw_gain"):
                     p[::2] = 12.0
-        level.refresh()
+        level.acting.refresh()
     return model
 
 

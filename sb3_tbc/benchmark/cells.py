@@ -263,7 +263,7 @@ def acting(rounds: int) -> tuple[str, dict[str, float]]:
     x, potentials = np.zeros((1, circuit.net.n_inputs), np.float32), np.zeros((1, circuit.state_dim), np.float32)
     jobs: dict[str, Job] = {
         "circuit": lambda: circuit(x, potentials),
-        "low level": lambda: model.low.act(x, potentials, True, rng, average=True),
+        "low level": lambda: model.low.acting.act(x, potentials, True, rng, average=True),
         "predict": lambda: model.predict(observation, state, deterministic=True),
     }
     figures = {name: 1e6 * min(times) for name, times in in_turns(jobs, rounds, calls=200).items()}

@@ -8,7 +8,6 @@ from typing import NoReturn, Protocol, cast
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.type_aliases import Schedule
@@ -16,7 +15,6 @@ from stable_baselines3.common.utils import FloatSchedule
 from torch import nn
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import HierarchyError, NonFiniteError
 from sb3_tbc.level.acting import ActingLevel
 from sb3_tbc.level.policies import LevelPolicy
@@ -54,7 +52,7 @@ def add_figures(total: dict[str, float], part: dict[str, float], share: float) -
 
 class SACLevel(SAC):
     """SAC for one level. It does not collect or store transitions: the agent that owns the level fills
-    its ``replay_buffer``.
+    its ``replay_buffer``, and acts with its ``acting``, an :class:`.ActingLevel`.
 
     :param policy: policy class, by default :class:`LevelPolicy`
     :param observation_space: flat observations of the level
@@ -257,18 +255,3 @@ class SACLevel(SAC):
     def state_dim(self) -> int:
         """Width of the actor's state, 0 for an MLP."""
         return self.acting.state_dim
-
-    def refresh(self) -> None:
-        """See :meth:`.ActingLevel.refresh`."""
-        self.acting.refresh()
-
-    def act(
-        self,
-        observations: FloatArray,
-        states: FloatArray,
-        deterministic: bool | NDArray[np.bool_],
-        rng: np.random.Generator,
-        average: bool = False,
-    ) -> tuple[FloatArray, FloatArray]:
-        """See :meth:`.ActingLevel.act`."""
-        return self.acting.act(observations, states, deterministic, rng, average)

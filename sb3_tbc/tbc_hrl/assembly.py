@@ -220,7 +220,7 @@ def make_high_buffer(
     """Replay of options, with time budgets to learn from where the reachability estimate teaches them."""
     teacher = None
     if reachability is not None and config.duration_loss_coef > 0:
-        teacher = DurationTeacher(ReachRule(views, rules, reachability, config.kappa), high)
+        teacher = DurationTeacher(ReachRule(views, rules, reachability, config.kappa), high.acting)
     return OptionReplayBuffer(
         config.high.buffer_size,
         high.observation_space,

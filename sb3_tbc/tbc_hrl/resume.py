@@ -112,7 +112,7 @@ def set_state(learning: LearningState, state: Mapping[str, AnyArray]) -> bool:
     if isinstance(actor, NDBCActor) and "circuit" in plain:
         actor.net.updates, actor.net.sub_steps = plain["circuit"]["updates"], plain["circuit"]["sub_steps"]
         actor.net.lipschitz.direction.copy_(actor.net.lipschitz.direction.new_tensor(state["direction"]))
-        learning.low.refresh()
+        learning.low.acting.refresh()
     return True
 
 

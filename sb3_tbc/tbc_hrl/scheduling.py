@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from sb3_tbc.arrays import Float32, FloatArray
-from sb3_tbc.level.level import SACLevel
+from sb3_tbc.level.acting import ActingLevel
 from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.smdp.views import LevelViews
@@ -71,7 +71,7 @@ class DurationTeacher:
     Time budget and subgoal are independent given the state (a diagonal Gaussian), so the mean's subgoal serves.
     """
 
-    def __init__(self, rule: ReachRule, high: SACLevel) -> None:
+    def __init__(self, rule: ReachRule, high: ActingLevel) -> None:
         self.rule, self.high = rule, high
         self._unused = np.random.default_rng(0)  # acting by the mean draws nothing
 

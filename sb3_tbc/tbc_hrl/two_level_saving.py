@@ -85,7 +85,7 @@ class TwoLevelSaving(PlainAlgorithm):
         """Load parameters of both levels in place, see SB3."""
         super().set_parameters(load_path_or_dict, exact_match, device)
         for level in (self.high, self.low):
-            level.refresh()
+            level.acting.refresh()
 
     def _drop_parts(self) -> None:
         del self.diagnostics  # the sign that there are parts whose random streams a seed restarts

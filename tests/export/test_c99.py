@@ -135,7 +135,7 @@ def test_a_time_budget_that_is_not_finite_is_refused(tmp_path: Path) -> None:
         for p in model.high.policy.average_actor.parameters():
             p.abs_()
         model.high.policy.average_actor.mu.weight[-1, ::2] *= -1.0
-    model.high.refresh()
+    model.high.acting.refresh()
     policy = extract(model)
     (tmp_path / "policy.c").write_text(to_c(policy))
     player = CPlayer(tmp_path / "policy.c", policy)

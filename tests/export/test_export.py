@@ -84,7 +84,7 @@ def test_actions_at_their_bounds_lie_in_the_space(kind: str, tmp_path: Path) -> 
     model = HAC("MultiInputPolicy", env, low={"policy_kwargs": {"mean_bound": None}}, compile=False)
     with th.no_grad():
         model.low.policy.average_actor.mu.bias += 100.0
-    model.low.refresh()
+    model.low.acting.refresh()
     policy, path = extract(model), tmp_path / f"policy{sb3_tbc.export.command.SUFFIXES[kind]}"
     sb3_tbc.export.command.WRITERS[kind](policy, path)
     seen, _ = env.reset(seed=0)

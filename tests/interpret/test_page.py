@@ -54,7 +54,7 @@ def half_a_step_too_long() -> TBCHRL:
     model = untrained(whole_budgets=True, dt_max=12.5, high={"policy_kwargs": {"mean_bound": None}})
     with th.no_grad():
         model.high.policy.average_actor.mu.bias[-1] += 100.0
-    model.high.refresh()
+    model.high.acting.refresh()
     return model
 
 

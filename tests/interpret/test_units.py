@@ -164,7 +164,7 @@ def test_hidden_units_of_an_mlp_are_units_too() -> None:
     assert units.names[8:10] == ("hidden1.0", "hidden1.1")
     inputs = np.random.default_rng(0).normal(size=(20, 6)).astype(np.float32)
     none = np.zeros((20, 0), dtype=np.float32)
-    expected, _ = model.low.act(inputs, none, True, np.random.default_rng(0), average=True)
+    expected, _ = model.low.acting.act(inputs, none, True, np.random.default_rng(0), average=True)
     np.testing.assert_allclose(units.step(inputs, none, no_lesion(units))[0], expected, atol=1e-6)
     held = clamp(units, range(8, 14), units.rest)
     assert np.ptp(units.step(inputs, none, held)[0]) == 0.0  # the whole last layer

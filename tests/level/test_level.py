@@ -61,7 +61,7 @@ def test_act_is_the_actor(actor: dict, average: bool) -> None:
     obs, states = inputs(level)
     for _ in range(2):
         level.train(3, 16)
-        actions, next_states = level.act(obs, states, True, np.random.default_rng(0), average)
+        actions, next_states = level.acting.act(obs, states, True, np.random.default_rng(0), average)
         torch_actor = level.policy.average_actor if average else level.actor
         mean, _, expected = torch_actor.step(th.from_numpy(obs), th.from_numpy(states))
         assert np.allclose(actions, mean.tanh().detach().numpy(), atol=1e-6)
@@ -73,7 +73,7 @@ def test_act_is_the_actor(actor: dict, average: bool) -> None:
 def test_act_samples_the_squashed_gaussian(activation: type[nn.Module]) -> None:
     level = make_level(policy_kwargs={"activation_fn": activation, "net_arch": [8], "log_std_bounds": (-1.0, -0.5)})
     obs, states = inputs(level)
-    actions, _ = level.act(obs, states, False, np.random.default_rng(5))
+    actions, _ = level.acting.act(obs, states, False, np.random.default_rng(5))
     noise = np.random.default_rng(5).standard_normal((4, 3), dtype=np.float32)
     mean, log_std, _ = level.actor.step(th.from_numpy(obs), th.from_numpy(states))
     assert np.allclose(actions, (mean + log_std.exp() * th.from_numpy(noise)).tanh().detach().numpy(), atol=1e-6)
@@ -83,7 +83,9 @@ def test_act_without_noise_where_a_mask_says_so() -> None:
     level = make_level()
     obs, states = inputs(level)
     mask = np.array([True, False, True, False])
-    mixed, surely, sampled = (level.act(obs, states, d, np.random.default_rng(5))[0] for d in (mask, True, False))
+    mixed, surely, sampled = (
+        level.acting.act(obs, states, d, np.random.default_rng(5))[0] for d in (mask, True, False)
+    )
     np.testing.assert_array_equal(mixed, np.where(mask[:, None], surely, sampled))
     assert not np.isclose(surely, sampled).any()
 
@@ -99,7 +101,7 @@ def test_parameters_return_in_place(actor: dict, tmp_path) -> None:
     level, other = make_level(actor), make_level(actor, seed=2)
     level.train(5, 16)
     level.save(tmp_path / "level.zip")
-    other.act(*inputs(other), True, np.random.default_rng(0))
+    other.acting.act(*inputs(other), True, np.random.default_rng(0))
     other.set_parameters(tmp_path / "level.zip")
     other.log_ent_coef.data = load_from_zip_file(tmp_path / "level.zip")[2]["log_ent_coef"].data
     assert all(f.is_aliased() for f in (other._update.actor, other._update.critic, other._update.average))
@@ -107,7 +109,7 @@ def test_parameters_return_in_place(actor: dict, tmp_path) -> None:
         trained.replay_buffer = RandomBuffer(level.state_dim, seed=7)
         trained.noise_rng = np.random.default_rng(7)
     for _ in range(2):
-        ours, theirs = (x.act(*inputs(x), True, np.random.default_rng(0))[0] for x in (level, other))
+        ours, theirs = (x.acting.act(*inputs(x), True, np.random.default_rng(0))[0] for x in (level, other))
         assert np.array_equal(ours, theirs)
         level.train(4, 16)
         other.train(4, 16)
@@ -119,9 +121,9 @@ def test_parameters_return_in_place(actor: dict, tmp_path) -> None:
 def test_loading_the_policy_alone_is_seen_by_act() -> None:
     level, other = make_level({"ndbc": NDBC}), make_level({"ndbc": NDBC}, seed=2)
     args = (*inputs(level), True, np.random.default_rng(0))
-    assert not np.allclose(level.act(*args)[0], other.act(*args)[0])
+    assert not np.allclose(level.acting.act(*args)[0], other.acting.act(*args)[0])
     other.policy.load_state_dict(level.policy.state_dict())
-    assert np.array_equal(level.act(*args)[0], other.act(*args)[0])
+    assert np.array_equal(level.acting.act(*args)[0], other.acting.act(*args)[0])
 
 
 def test_step_size_rule_reaches_acting_and_updates() -> None:
@@ -135,7 +137,9 @@ def test_step_size_rule_reaches_acting_and_updates() -> None:
     assert level.policy.average_actor.sub_steps == 6
     obs, states = inputs(level)
     mean, _, _ = level.actor.step(th.from_numpy(obs), th.from_numpy(states))
-    assert np.allclose(level.act(obs, states, True, np.random.default_rng(0))[0], mean.tanh().detach(), atol=1e-6)
+    assert np.allclose(
+        level.acting.act(obs, states, True, np.random.default_rng(0))[0], mean.tanh().detach(), atol=1e-6
+    )
 
 
 def test_same_seed_same_weights() -> None:
@@ -223,13 +227,13 @@ def test_a_copied_level_trains_on_its_own(actor: dict) -> None:
     level.train(2, 16)
     copied = copy.deepcopy(level)
     obs, states = inputs(level)
-    before = level.act(obs, states, True, np.random.default_rng(0))[0].copy()
-    copied.refresh()
-    assert np.array_equal(before, copied.act(obs, states, True, np.random.default_rng(0))[0])
+    before = level.acting.act(obs, states, True, np.random.default_rng(0))[0].copy()
+    copied.acting.refresh()
+    assert np.array_equal(before, copied.acting.act(obs, states, True, np.random.default_rng(0))[0])
     level.train(3, 16)
     copied.train(3, 16)
     mean, _, _ = copied.actor.step(th.from_numpy(obs), th.from_numpy(states))
-    ours, theirs = (x.act(obs, states, True, np.random.default_rng(0))[0] for x in (level, copied))
+    ours, theirs = (x.acting.act(obs, states, True, np.random.default_rng(0))[0] for x in (level, copied))
     assert np.allclose(theirs, mean.tanh().detach(), atol=1e-6)
     assert np.array_equal(ours, theirs)
     assert not np.allclose(before, ours)
@@ -244,7 +248,7 @@ def test_act_is_fast(actor: dict) -> None:
     times = []
     for _ in range(300):
         start = time.perf_counter()
-        level.act(obs, states, False, rng)
+        level.acting.act(obs, states, False, rng)
         times.append(time.perf_counter() - start)
     assert np.median(times) < (60e-6 if not actor else 120e-6)
 

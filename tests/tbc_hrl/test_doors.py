@@ -66,7 +66,7 @@ def stepped(model: TBCHRL) -> Any:
 def explored(model: TBCHRL) -> Any:
     model.learn(6, reset_num_timesteps=False)  # no episode ends, so there are no updates
     low = model.low
-    return low.act(np.ones((1, *low.observation_space.shape)), np.zeros((1, low.state_dim)), True, model.rng)[0]
+    return low.acting.act(np.ones((1, *low.observation_space.shape)), np.zeros((1, low.state_dim)), True, model.rng)[0]
 
 
 @pytest.mark.parametrize("door", [evaluated, stepped, explored])
@@ -78,8 +78,8 @@ def test_weights_changed_in_place_act_wherever_the_agent_does(door: Any) -> None
             parameter.mul_(-1.5)
     after = door(model)
     assert not np.array_equal(after, before)
-    model.high.refresh()
-    model.low.refresh()
+    model.high.acting.refresh()
+    model.low.acting.refresh()
     np.testing.assert_array_equal(door(model), after)
 
 

@@ -234,7 +234,7 @@ def test_teacher_labels_are_the_rule_for_the_subgoals_of_the_mean(monkeypatch: p
     seen = [Corridor().reset(seed=s)[0] for s in range(3)]
     batch = {key: np.stack([o[key] for o in seen]) for key in seen[0]}
     here = batch["achieved_goal"]
-    labels = DurationTeacher(model.replay_buffer.high.teacher.rule, model.high)(
+    labels = DurationTeacher(model.replay_buffer.high.teacher.rule, model.high.acting)(
         model.layout.high(batch), batch["observation"], here
     )
     _, state = model.predict(batch, deterministic=True)  # before any update the average is the actor
@@ -251,7 +251,7 @@ def test_duration_loss_draws_the_budget_to_the_rule(monkeypatch: pytest.MonkeyPa
         model = make(duration_loss_coef=coef, kappa=1.0, dt_max=10.0, high=level, gradient_ratio=0.0).learn(150)
         model.high.train(300, 16)
         seen = model.replay_buffer.high.data["observations"][:5]
-        unit, _ = model.high.act(seen, np.zeros((5, 0), np.float32), True, np.random.default_rng(0))
+        unit, _ = model.high.acting.act(seen, np.zeros((5, 0), np.float32), True, np.random.default_rng(0))
         budgets[coef] = float(model.rules.budget(unit[:, -1]).mean())
     assert budgets[100.0] == pytest.approx(8.0, abs=1.0)
     assert abs(budgets[0.0] - 8.0) > abs(budgets[100.0] - 8.0)

@@ -80,7 +80,7 @@ def test_tests_run_without_noise_if_asked(deterministic: bool) -> None:
     model.learn(20)
     collector = model.collector
     assert collector is not None
-    surely, _ = model.low.act(collector.observation, collector.membrane, True, np.random.default_rng(0))
+    surely, _ = model.low.acting.act(collector.observation, collector.membrane, True, np.random.default_rng(0))
     assert np.array_equal(collector.act()[0], surely) == deterministic
 
 
