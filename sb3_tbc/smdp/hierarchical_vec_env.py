@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
@@ -103,7 +103,9 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self.gives_up = gives_up
         self._everywhere = np.arange(venv.num_envs)
         self._no_memory = np.zeros((venv.num_envs, state_dim), dtype=np.float32)
-        self._recorder = EpisodeRecorder(venv.num_envs, self._sizes(space, state_dim))
+        sizes = {key: width(space, key) for key in GOAL_KEYS}
+        sizes |= {"actions": get_action_dim(venv.action_space), "states": state_dim, "next_states": state_dim}
+        self._recorder = EpisodeRecorder(venv.num_envs, sizes)
         ends_early = rules.ends_when_reached or views.subgoals.event is not None
         self._task_can_tell = ends_early and can_tell(venv)
         self.judge = EpisodeJudge(venv)
@@ -113,15 +115,6 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self._may_end: set[int] = set()  # environments that know the subgoal of that window
         self._held: dict[int, Arrays] = {}  # what a last window led to of which the task hears a step late
         self._given: AnyArray = np.zeros(0)  # what step_async was given
-
-    def _sizes(self, space: spaces.Dict, state_dim: int) -> dict[str, int]:
-        sizes = {key: width(space, key) for key in GOAL_KEYS}
-        return {
-            **sizes,
-            "actions": self.action_space.shape[0],  # type: ignore[index]
-            "states": state_dim,
-            "next_states": state_dim,
-        }
 
     def reset(self) -> FloatArray:
         """Reset every environment and ask for its first option."""

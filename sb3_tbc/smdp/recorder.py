@@ -13,6 +13,9 @@ from sb3_tbc.smdp.spaces import GoalObservation
 
 REASONS = tuple(TerminationReason)
 
+FIRST_ROWS = 1025
+"""Rows to make room for at first; grows by doubling."""
+
 Place = tuple[Indices | slice, IntArray | int]
 """Index of rows in arrays ``(n_envs, steps, .)``: environments, and the step of each."""
 
@@ -22,21 +25,20 @@ class EpisodeRecorder:
 
     :param n_envs: number of environments
     :param sizes: width of each recorded quantity: the fields of :class:`~sb3_tbc.smdp.options.Episode` by name
-    :param capacity: steps to make room for at first; grows by doubling
     """
 
     _exact = ("achieved_goal", "desired_goal")
 
-    def __init__(self, n_envs: int, sizes: dict[str, int], capacity: int = 1024) -> None:
+    def __init__(self, n_envs: int, sizes: dict[str, int]) -> None:
         self.n_envs = n_envs
         self.steps = np.zeros(n_envs, dtype=np.int64)
         self.options: list[list[Option]] = [[] for _ in range(n_envs)]
         self._all = np.arange(n_envs)
         self._data = {
-            name: np.zeros((n_envs, capacity + 1, size), dtype=np.float64 if name in self._exact else np.float32)
+            name: np.zeros((n_envs, FIRST_ROWS, size), dtype=np.float64 if name in self._exact else np.float32)
             for name, size in sizes.items()
         }
-        self._rewards = np.zeros((n_envs, capacity + 1))
+        self._rewards = np.zeros((n_envs, FIRST_ROWS))
 
     def begin(self, indices: NDArray[np.intp], observation: GoalObservation) -> None:
         """Start new episodes; the arrays have one row per entry of ``indices``."""

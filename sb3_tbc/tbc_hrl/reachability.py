@@ -16,6 +16,8 @@ from sb3_tbc.smdp.spaces import SubgoalSpace
 UPDATE_EVERY = 4
 """Environment steps per update of the estimate."""
 BATCH_SIZE = 256
+HIDDEN = (64, 64)
+"""Widths of the hidden layers."""
 
 
 class Reachability(nn.Module):
@@ -28,7 +30,6 @@ class Reachability(nn.Module):
     :param unit: a typical number of steps, the output's scale
     :param horizon: longest way that is learnt, steps
     :param expectile: below 0.5 leans toward short ways
-    :param hidden: widths of the hidden layers
     :param learning_rate: Adam's
     :param seed: of the weights and of what is sampled
     :raises ValueError: if ``expectile`` is not in (0, 1)
@@ -40,7 +41,6 @@ class Reachability(nn.Module):
         unit: float,
         horizon: int,
         expectile: float = 0.3,
-        hidden: tuple[int, ...] = (64, 64),
         learning_rate: float = 1e-3,
         seed: int | None = None,
     ) -> None:
@@ -49,7 +49,7 @@ class Reachability(nn.Module):
             raise ValueError(f"expectile must lie in (0, 1), got {expectile}")
         self.subgoals, self.unit, self.horizon, self.expectile = subgoals, unit, horizon, expectile
         self.rng = np.random.default_rng(seed)
-        sizes = (subgoals.local_dim + 2 * subgoals.dim, *hidden, 1)
+        sizes = (subgoals.local_dim + 2 * subgoals.dim, *HIDDEN, 1)
         with th.random.fork_rng(devices=[]):
             th.manual_seed(0 if seed is None else seed)
             self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in itertools.pairwise(sizes))
