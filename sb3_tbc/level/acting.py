@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
+from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
 from sb3_tbc.arrays import FloatArray, FloatType
@@ -180,7 +181,7 @@ class FrozenActor:
         self._net = freeze(actor, self._dtype)
         self._weights = Weights(actor)
         head: GaussianHead = actor.head
-        self._dim = int(np.prod(actor.action_space.shape))
+        self._dim = get_action_dim(actor.action_space)
         mean_bound = np.inf if head.mean_bound is None else head.mean_bound
         low, high = head.log_std_bounds
         self._lowest, self._highest = (

@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.preprocessing import get_action_dim
 from torch.utils._pytree import TreeSpec, tree_flatten, tree_leaves, tree_unflatten
 
 from sb3_tbc.aliases import Plain
@@ -84,7 +85,7 @@ class SACUpdate:
         policy.actor.optimizer = flat_adam(self.actor.vector, policy.actor.optimizer)
         policy.critic.optimizer = flat_adam(self.critic.vector, policy.critic.optimizer)
         self.ent_coef_optimizer = ent_coef_optimizer
-        self.action_dim = math.prod(policy.action_space.shape or (1,))
+        self.action_dim = get_action_dim(policy.action_space)
         self.compile = compile
         self.label_coef, self.average_decay, self.earlier_steps = label_coef, average_decay, earlier_steps
         self._steps: dict[tuple[int, int], Callable[..., None]] = {}

@@ -14,6 +14,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BaseModel, BasePolicy, ContinuousCritic
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
@@ -146,8 +147,8 @@ class RecurrentSACPolicy(SACPolicy):
         return {**super()._get_constructor_parameters(), **self.memory_kwargs}
 
     def _extractor(self, cell: str, cell_kwargs: PlainMapping) -> MemoryExtractor:
-        width = int(np.prod(self.action_space.shape or ()))
-        return MemoryExtractor(self.observation_space, width, cell, self.memory_kwargs["hidden_size"], cell_kwargs)
+        hidden_size, action_dim = self.memory_kwargs["hidden_size"], get_action_dim(self.action_space)
+        return MemoryExtractor(self.observation_space, action_dim, cell, hidden_size, cell_kwargs)
 
     def make_actor(self, features_extractor: Any = None) -> RecurrentActor:
         """Build the actor with its memory."""
@@ -195,8 +196,8 @@ class RecurrentSACPolicy(SACPolicy):
         return unit.cpu().numpy(), after.cpu().numpy()
 
     def _blank(self, n: int) -> State:
-        width = int(np.prod(self.action_space.shape or ()))
-        return np.zeros((n, self.actor.features_extractor.cell.state_dim)), np.zeros((n, width))
+        state_dim, action_dim = self.actor.features_extractor.cell.state_dim, get_action_dim(self.action_space)
+        return np.zeros((n, state_dim)), np.zeros((n, action_dim))
 
     def _checked(self, state: State | None, n: int) -> State:
         """A state for ``n`` environments: that given, or where there is none, that of episodes that begin.

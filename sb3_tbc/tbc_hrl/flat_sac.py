@@ -8,10 +8,10 @@ import warnings
 from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
-import numpy as np
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import MultiInputPolicy
@@ -119,7 +119,7 @@ class FlatSAC(PlainAlgorithm, KeepsLastStep, SAC):
         if self.settings.get("average_decay") and self.policy_class is MultiInputPolicy:
             self.policy_class = AveragedPolicy
         if self.target_entropy == "auto":
-            self.target_entropy = -float(np.prod(self.action_space.shape or ()))  # SB3 asks the environment
+            self.target_entropy = -float(get_action_dim(self.action_space))  # SB3 asks the environment
         if self.env is None:
             self.replay_buffer = _NO_BUFFER  # so that SB3 makes none
         else:
