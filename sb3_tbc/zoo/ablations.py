@@ -90,7 +90,7 @@ def _net_arch(level: str, pi: Sequence[int], qf: Sequence[int]) -> Plain:
 def _fit_actor(level: SACLevel, missing: int, total: int) -> Plain:
     """Widths of the low level's MLP actor, as even as the count allows."""
     pi, qf = _hidden(level)
-    inputs, outputs = level.observation_space.shape[0], 2 * level.action_space.shape[0]  # type: ignore[index]
+    inputs, outputs = level.observation_space.shape[0], 2 * level.action_space.shape[0]
     wanted = mlp_parameters([inputs, *pi, outputs]) + missing
     found = []
     for width in range(1, WIDEST):
@@ -122,4 +122,4 @@ def _before_last(level: SACLevel, qf: Sequence[int]) -> int:
     """Width of the layer below a critic's last hidden layer."""
     if len(qf) > 1:
         return qf[-2]
-    return int(level.observation_space.shape[0] + level.action_space.shape[0])  # type: ignore[index]
+    return int(level.observation_space.shape[0] + level.action_space.shape[0])
