@@ -69,6 +69,11 @@ class LastWindow(NamedTuple):
         return bool(self.subgoals.reached(self.subgoals.achieved(seen), self.subgoal))
 
 
+def announce(venv: VecEnv, index: int, window: LastWindow) -> None:
+    """Tell one environment of a vector which window is the last of its episode."""
+    venv.env_method(ANNOUNCE, window, indices=[index])
+
+
 class EpisodeLimit(Wrapper, RecordConstructorArgs):
     """Truncates the step that ends the announced last window; refuses observations and infos of the wrong form.
 

@@ -15,10 +15,10 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices, put_under, taken_from
 from sb3_tbc.errors import HierarchyError
 from sb3_tbc.smdp.episode_limit import (
-    ANNOUNCE,
     BUDGET_EXHAUSTED,
     CopyableVecEnvWrapper,
     LastWindow,
+    announce,
     can_tell,
     with_episode_limit,
 )
@@ -306,18 +306,18 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
             if self.clock.used[index] >= self.rules.max_options:
                 self._last_step[index] = max(1, math.ceil(self.clock.time_budget[index]))
                 if self._task_can_tell and self.views.subgoals.event is not None:
-                    self.venv.env_method(ANNOUNCE, LastWindow(False, self.views.subgoals), indices=[index])
+                    announce(self.venv, index, LastWindow(False, self.views.subgoals))
 
     def _announce_ends(self) -> None:
         """Tell the environments whose last window is, or may be, over with the next step, to end the episode then."""
         for index, last in self._last_step.items():
             step = self.clock.elapsed[index] + 1
             if step >= last:
-                self.venv.env_method(ANNOUNCE, LastWindow(True), indices=[index])
+                announce(self.venv, index, LastWindow(True))
             elif step >= self.rules.dt_min and index not in self._may_end and self._ends_early:
                 self._may_end.add(index)
-                window = LastWindow(False, self.views.subgoals, self.clock.subgoal[index].copy())
-                self.venv.env_method(ANNOUNCE, window, indices=[index])
+                subgoal = self.clock.subgoal[index].copy()
+                announce(self.venv, index, LastWindow(False, self.views.subgoals, subgoal))
 
     @property
     def _ends_early(self) -> bool:

@@ -14,10 +14,10 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, FloatArray, Indices
 from sb3_tbc.errors import EnvironmentFault, NonFiniteError
 from sb3_tbc.smdp.episode_limit import (
-    ANNOUNCE,
     BAD_STEP,
     CopyableVecEnvWrapper,
     LastWindow,
+    announce,
     checked,
     shapes_of,
     with_episode_limit,
@@ -134,7 +134,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         subgoals = self.policy.views.subgoals
         if subgoals.event is not None:
             for index in np.flatnonzero(self.clock.used >= self.policy.rules.max_options):
-                self.venv.env_method(ANNOUNCE, LastWindow(False, subgoals), indices=[int(index)])
+                announce(self.venv, int(index), LastWindow(False, subgoals))
 
     def _act(self, live: Indices) -> AnyArray:
         """The low level's actions in the environments whose option is running."""
@@ -162,10 +162,10 @@ class OptionEnv(CopyableVecEnvWrapper):
         """Tell an environment that its episode ends with this step, or if this step reaches the subgoal."""
         step, rules = self.clock.elapsed[index] + 1, self.policy.rules
         if step >= self.clock.time_budget[index]:
-            self.venv.env_method(ANNOUNCE, LastWindow(True), indices=[index])
+            announce(self.venv, index, LastWindow(True))
         elif rules.ends_when_reached and step == max(1, math.ceil(rules.dt_min)):
-            window = LastWindow(False, self.policy.views.subgoals, self.clock.subgoal[index].copy())
-            self.venv.env_method(ANNOUNCE, window, indices=[index])
+            subgoal = self.clock.subgoal[index].copy()
+            announce(self.venv, index, LastWindow(False, self.policy.views.subgoals, subgoal))
 
     def _refuse_bad(self, index: int, reward: float, info: Plain) -> None:
         """Let nothing through that is not finite, or of another shape.
