@@ -46,8 +46,22 @@ class SB3Arguments(Settings):
     """Whether to build the networks now."""
 
     def check(self) -> None:
-        """Refuse a device that is not there."""
-        check_device(self.device)
+        """Refuse a device that is not there.
+
+        :raises SettingError: naming the devices there are
+        """
+        if self.device == "auto":
+            return
+        try:
+            kind = th.device(self.device).type
+        except RuntimeError:
+            raise SettingError(
+                "device", f"must be 'auto', 'cpu', 'cuda' or 'cuda:<number>', got {self.device!r}"
+            ) from None
+        if kind == "cuda" and not th.cuda.is_available():
+            raise SettingError(
+                "device", f"{str(self.device)!r} needs a GPU, and torch finds none on this machine; use device='cpu'"
+            )
 
     @classmethod
     def taken_from(cls: type[SelfArguments], arguments: PlainMapping) -> tuple[SelfArguments, Plain]:
@@ -55,23 +69,6 @@ class SB3Arguments(Settings):
         own = {name: value for name, value in arguments.items() if name in hints(cls)}
         others = {name: value for name, value in arguments.items() if name not in own}
         return cls.from_dict(own), others
-
-
-def check_device(device: str | th.device) -> None:
-    """Check that torch knows a device and can use it.
-
-    :raises SettingError: naming the devices there are
-    """
-    if device == "auto":
-        return
-    try:
-        kind = th.device(device).type
-    except RuntimeError:
-        raise SettingError("device", f"must be 'auto', 'cpu', 'cuda' or 'cuda:<number>', got {device!r}") from None
-    if kind == "cuda" and not th.cuda.is_available():
-        raise SettingError(
-            "device", f"{str(device)!r} needs a GPU, and torch finds none on this machine; use device='cpu'"
-        )
 
 
 @dataclass(frozen=True, kw_only=True)
