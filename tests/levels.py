@@ -47,7 +47,9 @@ class FixedBuffer:
 
 def make_level(batches: LevelBatch, compile: bool | str = False, **kwargs: object) -> SACLevel:
     arguments = {"learning_rate": 1e-3, "policy_kwargs": {"net_arch": [16, 16]}, "seed": 3, **kwargs}
-    return SACLevel("MlpPolicy", OBSERVATIONS, ACTIONS, FixedBuffer(batches), compile=compile, **arguments)
+    level = SACLevel(OBSERVATIONS, ACTIONS, compile=compile, **arguments)
+    level.replay_buffer = FixedBuffer(batches)
+    return level
 
 
 class LabelledBuffer(FixedBuffer):

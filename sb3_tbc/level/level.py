@@ -51,13 +51,11 @@ def add_figures(total: dict[str, float], part: dict[str, float], share: float) -
 
 
 class SACLevel(SAC):
-    """SAC for one level. It does not collect or store transitions: the agent that owns the level fills
-    its ``replay_buffer``, and acts with its ``acting``, an :class:`.ActingLevel`.
+    """SAC for one level. It does not collect or store transitions: the agent that owns the level sets and
+    fills its ``replay_buffer``, and acts with its ``acting``, an :class:`.ActingLevel`.
 
-    :param policy: policy class, by default :class:`LevelPolicy`
     :param observation_space: flat observations of the level
     :param action_space: the level's actions, unit coordinates
-    :param replay_buffer: gives :class:`LevelBatch` bursts; may be set later
     :param ent_coef_learning_rate: learning rate of the automatic temperature, by default ``learning_rate``
     :param actor_learning_rate: learning rate of the actor, by default ``learning_rate``; circuits need larger steps
         than critics
@@ -82,10 +80,8 @@ class SACLevel(SAC):
 
     def __init__(
         self,
-        policy: type[LevelPolicy] | str,
         observation_space: spaces.Box,
         action_space: spaces.Box,
-        replay_buffer: BurstBuffer | None = None,
         learning_rate: float | Schedule = 3e-4,
         gamma: float = 0.99,
         tau: float = 0.005,
@@ -105,7 +101,7 @@ class SACLevel(SAC):
         earlier_steps: int = 0,
     ) -> None:
         super().__init__(
-            LevelPolicy if isinstance(policy, str) else policy,
+            LevelPolicy,
             SpacesOnlyVecEnv(observation_space, action_space),
             learning_rate=learning_rate,
             buffer_size=1,
@@ -126,7 +122,7 @@ class SACLevel(SAC):
         self.bounds, self.actor_q, self.earlier_steps = bounds, actor_q, earlier_steps
         self.set_logger(Logger(folder=None, output_formats=[]))
         self._setup_model()
-        self.replay_buffer = replay_buffer  # type: ignore[assignment]
+        self.replay_buffer = None
 
     def _setup_model(self) -> None:
         super()._setup_model()

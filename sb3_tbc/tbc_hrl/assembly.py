@@ -10,7 +10,6 @@ from gymnasium import spaces
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.level.level import SACLevel
-from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.smdp.bounds import RewardRange, ValueBounds, high_level_bounds, low_level_bounds
 from sb3_tbc.smdp.hindsight import HindsightSettings
@@ -184,7 +183,6 @@ def _make_level(
 ) -> SACLevel:
     actor_rate = level.actor_learning_rate
     return SACLevel(
-        LevelPolicy,
         observations,
         actions,
         learning_rate=learning_rate_of(level.learning_rate),

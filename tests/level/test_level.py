@@ -15,7 +15,6 @@ from torch import nn
 
 from sb3_tbc.errors import HierarchyError, NonFiniteError
 from sb3_tbc.level.level import SACLevel
-from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.replay.batch import LevelBatch
 
 OBSERVATIONS = spaces.Box(-np.inf, np.inf, (6,), np.float32)
@@ -43,7 +42,7 @@ class RandomBuffer:
 def make_level(actor: dict | None = None, **kwargs: object) -> SACLevel:
     policy_kwargs = {"net_arch": [8, 7], "mean_bound": 3.0, **(actor or {}), **kwargs.pop("policy_kwargs", {})}
     arguments = {"seed": 1, "compile": False, "learning_rate": 1e-2, "name": "low", **kwargs}
-    level = SACLevel("MlpPolicy", OBSERVATIONS, ACTIONS, None, policy_kwargs=policy_kwargs, **arguments)
+    level = SACLevel(OBSERVATIONS, ACTIONS, policy_kwargs=policy_kwargs, **arguments)
     level.replay_buffer = RandomBuffer(level.state_dim)
     return level
 
@@ -258,7 +257,7 @@ def test_loading_a_level_alone_is_refused_before_anything_is_unpickled(tmp_path:
         def __reduce__(self) -> tuple[object, ...]:
             return Path.touch, (tmp_path / "ran",)
 
-    level = SACLevel(LevelPolicy, OBSERVATIONS, ACTIONS, name="low", compile=False)
+    level = SACLevel(OBSERVATIONS, ACTIONS, name="low", compile=False)
     level.stranger = Payload()
     level.save(tmp_path / "level.zip")
     with pytest.raises(TypeError, match=r"a level is loaded with its agent: use TBCHRL\.load"):
