@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from numbers import Integral
-from typing import Any, NamedTuple, SupportsFloat
+from typing import Any, NamedTuple, SupportsFloat, cast
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
@@ -118,7 +120,8 @@ class DescribedGoalEnv(Wrapper):
     Rewards are shifted so that the reward at the goal becomes 0: the mazes of Gymnasium-Robotics pay 1 and 0, its
     robots 0 and -1. In hindsight a goal is reached where the task pays its highest reward or, if the reward is dense,
     where the task's success test says so. Success of a step is what ``info`` says under ``is_success`` or ``success``,
-    else the same test.
+    else the same test. Where ``env`` is a ``Monitor``, as in ``make_vec_env(id, wrapper_class=DescribedGoalEnv)``, the
+    Monitor sees episodes end with success, too, and keeps the task's own rewards.
 
     :param env: a goal environment
     :param terminate_on_success: end episodes with success, as our own tasks do
@@ -135,7 +138,11 @@ class DescribedGoalEnv(Wrapper):
         **given: Any,
     ) -> None:
         super().__init__(env)
-        self.description = description or describe_goal_env(env, **given)
+        monitor = _monitor_in(env) if terminate_on_success else None
+        task = env if monitor is None else monitor.env  # its random episodes are none of the Monitor's
+        self.description = description or describe_goal_env(task, **given)
+        if monitor is not None:
+            monitor.env = _EndsWithSuccess(task, self.description.success_test)
         self.subgoals = self.description.subgoals
         self.achieved_in_observation = self.description.achieved_in_observation
         self.observation_scale = self.description.observation_scale
@@ -164,12 +171,57 @@ class DescribedGoalEnv(Wrapper):
     def step(self, action: object) -> tuple[GoalObservation, SupportsFloat, bool, bool, Plain]:
         """Step; adds ``is_success``, shifts the reward, ends the episode with success."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        success = said_success(info)
-        if success is None:
-            success = bool(self._reached(observation["achieved_goal"], observation["desired_goal"]))
-        info["is_success"] = success
+        success = info["is_success"] = _succeeded(observation, info, self._reached)
         ended = bool(terminated or (self._terminate_on_success and success))
         return observation, float(reward) - self._best, ended, truncated, info
+
+
+class _EndsWithSuccess(Wrapper):
+    """Ends episodes with success beneath a Monitor. Above it, SB3 would count those alone that end otherwise."""
+
+    def __init__(self, env: Env, success_test: SuccessTest) -> None:
+        super().__init__(env)
+        self.success_test = success_test
+
+    def step(self, action: object) -> tuple[GoalObservation, SupportsFloat, bool, bool, Plain]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        success = info["is_success"] = _succeeded(observation, info, self._reached)
+        return observation, reward, bool(terminated or success), truncated, info
+
+    def _reached(self, achieved: ArrayLike, desired: ArrayLike) -> NDArray[np.bool_]:
+        goals = (np.atleast_2d(np.asarray(goal, dtype=np.float64)) for goal in (achieved, desired))
+        return self.success_test.function_for(self.env)(*goals)[0]  # type: ignore[no-any-return]
+
+
+def _succeeded(
+    observation: GoalObservation, info: Plain, reached: Callable[[ArrayLike, ArrayLike], NDArray[np.bool_]]
+) -> bool:
+    """Success of a step: what ``info`` says, else a test."""
+    said = said_success(info)
+    return bool(reached(observation["achieved_goal"], observation["desired_goal"])) if said is None else said
+
+
+def _monitor_in(env: Env) -> Wrapper | None:
+    """The innermost Monitor; None without one.
+
+    :raises ValueError: if another wrapper is around it, which may see other goals than the Monitor does
+    """
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    places = [place for place, layer in enumerate(layers) if _is_monitor(layer)]
+    between = [type(layer).__name__ for layer in layers[: max(places, default=0)] if not _is_monitor(layer)]
+    if between:
+        raise ValueError(
+            f"the Monitor beneath {', '.join(between)} does not see the episodes that DescribedGoalEnv ends with "
+            "success: put the Monitor around all wrappers, or DescribedGoalEnv directly around the Monitor"
+        )
+    return cast(Wrapper, layers[places[-1]]) if places else None
+
+
+def _is_monitor(env: Env) -> bool:
+    """Whether it is SB3's Monitor or derived from it, found by name, as tasks need no SB3."""
+    return any(kind.__module__ == "stable_baselines3.common.monitor" for kind in type(env).__mro__)
 
 
 # -- what describe_goal_env is made of ---------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from making import make
 from points import Boxed, Dense, Point
 from sb3_tbc.tasks import TASKS
 from sb3_tbc.tasks.generic import DescribedGoalEnv, check_goal_env, describe_goal_env, subgoal_space_of
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_tbc.zoo.environments import make_env
 
@@ -304,6 +305,30 @@ def test_wrapper_adds_success_and_ends_episodes():
     patient.reset(seed=0)
     patient.unwrapped.goal = patient.unwrapped.position.copy()
     assert patient.step(np.zeros(2))[2] is False
+
+
+def test_a_monitor_beneath_sees_the_episodes_that_end_with_success(tmp_path):
+    """SB3 evaluates by what the Monitor sees: an agent that always succeeded was evaluated for ever."""
+    log = tmp_path / "monitor.csv"
+    env = DescribedGoalEnv(Monitor(Point(), str(log), info_keywords=("is_success",)), n_probe_steps=200)
+    for steps in (1, 3):
+        env.reset(seed=steps)
+        for _ in range(steps - 1):
+            assert "episode" not in env.step(np.zeros(2))[4]
+        env.unwrapped.goal = env.unwrapped.position.copy()
+        _, reward, terminated, _, info = env.step(np.zeros(2))
+        assert (reward, terminated, info["is_success"], info["episode"]["l"]) == (0.0, True, True, steps)
+    assert len(log.read_text().splitlines()) == 2 + 2  # the random episodes of the description are not among them
+    patient = DescribedGoalEnv(Monitor(Point()), terminate_on_success=False)
+    patient.reset(seed=0)
+    patient.unwrapped.goal = patient.unwrapped.position.copy()
+    assert patient.step(np.zeros(2))[2] is False
+
+
+def test_wrappers_between_that_hide_the_end_from_a_monitor_are_refused():
+    with pytest.raises(ValueError, match=r"the Monitor beneath TimeLimit does not see .* directly around the Monitor"):
+        DescribedGoalEnv(TimeLimit(Monitor(Point()), 20))
+    DescribedGoalEnv(Monitor(TimeLimit(Point(), 20)))
 
 
 def test_wrapper_brings_rewards_to_zero_and_minus_one():
