@@ -16,7 +16,7 @@ from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, goal_space_pro
 from sb3_tbc.smdp.hindsight import GoalTest
 
 TRIED = 3
-"""Size of the batch of goals on which a task's functions are tried before learning begins."""
+"""Goals on which a task's functions are tried before learning begins; one more where goals have as many entries."""
 
 
 def goal_test_of(venv: VecEnv) -> GoalTest:
@@ -58,10 +58,10 @@ def goal_test_of(venv: VecEnv) -> GoalTest:
     return GoalTest(reward, terminated if venv.has_attr("compute_terminated") else as_good_as_the_goal)
 
 
-def check_goal_test(venv: VecEnv, infos: list[Plain] | None = None) -> None:
+def check_goal_test(venv: VecEnv, listed_infos: bool = False) -> None:
     """Try the calls that learning makes, on goals from the task's own goal space, before anything is learnt.
 
-    :param infos: tried, too, as ``info``: SB3's hindsight replay gives a list of them, one for each goal
+    :param listed_infos: also try a list of empty infos, one for each goal, as SB3's hindsight replay gives it
     :raises ConfigError: if the task does not have the functions, or they do not take batches
     """
     if not venv.has_attr("compute_reward"):
@@ -72,14 +72,16 @@ def check_goal_test(venv: VecEnv, infos: list[Plain] | None = None) -> None:
     _refuse_other_goals(venv)
     space = deepcopy(check_goal_space(venv.observation_space)["achieved_goal"])
     space.seed(0)
-    achieved, desired = (np.stack([space.sample() for _ in range(TRIED)]).astype(np.float64) for _ in range(2))
+    # as many goals as entries would look alike to a function that takes a batch for one goal
+    n = TRIED + (space.shape == (TRIED,))
+    achieved, desired = (np.stack([space.sample() for _ in range(n)]).astype(np.float64) for _ in range(2))
     try:
         test = goal_test_of(venv)
         given = achieved.copy(), desired.copy()
         test.reward(achieved, desired)
         test.terminated(achieved, desired)
-        if infos is not None:
-            venv.env_method("compute_reward", achieved, desired, infos, indices=[0])
+        if listed_infos:
+            venv.env_method("compute_reward", achieved, desired, [{}] * n, indices=[0])
         if not (np.array_equal(given[0], achieved) and np.array_equal(given[1], desired)):
             raise ConfigError(
                 "compute_reward or compute_terminated changes the goals that it is given (as 'achieved_goal -= ...' "
@@ -89,10 +91,10 @@ def check_goal_test(venv: VecEnv, infos: list[Plain] | None = None) -> None:
         raise
     except Exception as error:  # a task's own code may fail in any way
         raise ConfigError(
-            f"compute_reward or compute_terminated fails on a batch of {TRIED} goals with an empty info"
-            f"{'' if infos is None else ', or a list of empty ones as SB3 gives it'}: {type(error).__name__}: {error}. "
-            "Learning in hindsight asks for rewards of goals that were never the task's, of whose steps there is no "
-            "info: let them depend on the goals alone"
+            f"compute_reward or compute_terminated fails on a batch of {n} goals with an empty info"
+            f"{', or a list of empty ones as SB3 gives it' if listed_infos else ''}: {type(error).__name__}: {error}. "
+            "Vectorise it: goals are arrays (n, goal_dim). Learning in hindsight asks for rewards of goals that were "
+            "never the task's, of whose steps there is no info: let them depend on the goals alone"
         ) from error
 
 

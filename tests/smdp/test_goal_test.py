@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from corridor import Corridor
+from gymnasium import spaces
 from gymnasium.wrappers import TransformReward
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
@@ -36,6 +37,26 @@ def test_an_answer_for_one_pair_is_not_taken_for_all() -> None:
     np.testing.assert_array_equal(test.reward(achieved, desired), [0.0, -1.0, 0.0])
 
 
+@pytest.mark.parametrize("dim", [1, 2, 3, 4])
+def test_a_reward_for_one_goal_is_refused_before_learning_whatever_its_size(dim: int) -> None:
+    """Of as many goals as entries it gives as many values, which look like one for each goal."""
+
+    class OneGoal(Corridor):
+        def __init__(self) -> None:
+            super().__init__()
+            goals = {key: spaces.Box(-1.0, 1.0, (dim,), np.float64) for key in ("achieved_goal", "desired_goal")}
+            self.observation_space = spaces.Dict({**self.observation_space.spaces, **goals})
+
+        def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+            return -np.sqrt(sum((achieved_goal[i] - desired_goal[i]) ** 2 for i in range(dim)))
+
+        def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+            return False
+
+    with pytest.raises(ConfigError, match="Vectorise it: goals are arrays"):
+        check_goal_test(DummyVecEnv([OneGoal]))
+
+
 def test_stacked_goals_are_refused_with_a_subgoal_space_of_their_own_too() -> None:
     """The task would take a part of an earlier goal for the present one, and hindsight would learn that."""
     stacked = VecFrameStack(DummyVecEnv([Corridor]), 2)
@@ -59,7 +80,7 @@ def test_a_list_of_infos_is_tried_where_learning_gives_one() -> None:
     """SB3's hindsight replay does; that it fails must not be found out after the first episode."""
     check_goal_test(DummyVecEnv([ReadsInfo]))
     with pytest.raises(ConfigError, match="a list of empty ones as SB3 gives it: AttributeError"):
-        check_goal_test(DummyVecEnv([ReadsInfo]), infos=[{}] * 3)
+        check_goal_test(DummyVecEnv([ReadsInfo]), listed_infos=True)
     with pytest.raises(ConfigError, match="a list of empty ones"):
         FlatSAC("MultiInputPolicy", ReadsInfo())
 
