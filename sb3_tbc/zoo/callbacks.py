@@ -21,6 +21,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import save_atomic, write_atomic
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_text
+from sb3_tbc.stopping import StopEvaluation, StoppableVecEnv, StopRequest
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
@@ -99,6 +100,8 @@ class SuccessEvalCallback(EventCallback):
     :param wall_time: seconds that earlier parts of a resumed run took
     :param callback_on_new_best: called after a new best was saved
     :param callback_after_eval: called after each evaluation; returning ``False`` stops training
+    :param stop: tells whether the user asked to stop; then an evaluation is given up and training stops. The next
+        ``learn`` begins with it
     """
 
     def __init__(
@@ -113,11 +116,13 @@ class SuccessEvalCallback(EventCallback):
         callback_on_new_best: BaseCallback | None = None,
         callback_after_eval: BaseCallback | None = None,
         verbose: int = 0,
+        stop: StopRequest | None = None,
     ) -> None:
         super().__init__(callback_after_eval, verbose=verbose)
         if eval_freq < 1 or n_eval_episodes < 1:
             raise ValueError(f"eval_freq and n_eval_episodes must be at least 1, got {eval_freq} and {n_eval_episodes}")
-        self.eval_env = eval_env
+        self.eval_env = eval_env if stop is None else StoppableVecEnv(eval_env, stop)
+        self.stoppable, self.given_up = stop is not None, False
         self.eval_freq = eval_freq
         self.n_eval_episodes = n_eval_episodes
         self.seed = seed
@@ -144,13 +149,26 @@ class SuccessEvalCallback(EventCallback):
         return self._earlier + time.monotonic() - self._started
 
     def _on_training_start(self) -> None:
+        super()._on_training_start()
         self._last = min(self._last, self.model.num_timesteps)  # another call of learn may count from zero again
+        # before anything is learnt: the resumed run then evaluates the agent that an undisturbed one does
+        if self.stoppable and self._is_due() and not self._evaluate_unless_stopped():
+            raise StopTraining
 
     def _on_step(self) -> bool:
-        if self.num_timesteps // self.eval_freq <= self._last // self.eval_freq:
-            return True
+        return not self._is_due() or self._evaluate_unless_stopped()
+
+    def _is_due(self) -> bool:
+        return self.num_timesteps // self.eval_freq > self._last // self.eval_freq
+
+    def _evaluate_unless_stopped(self) -> bool:
+        """Evaluate; False if training is to stop."""
+        try:
+            self.evaluate()
+        except StopEvaluation:
+            self.given_up = True
+            return False
         self._last = self.num_timesteps
-        self.evaluate()
         return self._on_event()
 
     def evaluate(self) -> EvaluationRow:

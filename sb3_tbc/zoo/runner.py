@@ -212,12 +212,12 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
         with explained(folder.path):
             folder.tidy()
         # with another total, the agent at the end of training may be that of an earlier part, before the checkpoint
-        if not folder.finished and not changed and _trained(folder) >= spec.run.n_timesteps:
+        if not folder.finished and not changed and trained_steps(folder) >= spec.run.n_timesteps:
             return _only_evaluate(spec, folder, options)
         return _go_on(spec, folder, options, command if changed else "")
 
 
-def _trained(folder: RunFolder) -> int:
+def trained_steps(folder: RunFolder) -> int:
     """Steps of the agent at the end of training; 0 if training has not ended."""
     if not folder.model.is_file():
         return 0
@@ -306,7 +306,7 @@ class Training:
         self.evaluations = SuccessEvalCallback(
             env, spec.eval_freq, spec.n_eval_episodes, seed=seed, csv_path=self.folder.evaluations,
             best_model_path=self.folder.best_model, wall_time=self.earlier, callback_after_eval=self.after_eval,
-            verbose=self.options.verbose,
+            verbose=self.options.verbose, stop=self.options.stop,
         )  # fmt: skip
         try:
             self._train()
@@ -342,7 +342,7 @@ class Training:
             self.model.learn(
                 left, callback=CallbackList(callbacks), reset_num_timesteps=fresh, progress_bar=options.progress
             )
-            if options.stop and self.model.num_timesteps < wanted:
+            if options.stop and (self.evaluations.given_up or self.model.num_timesteps < wanted):
                 raise StopTraining
         except StopTraining as stop:
             if options.save_at_end:

@@ -6,13 +6,16 @@ import os
 import re
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
-from injection import SMALL, differences, finish, run, spawn, the_run, wait
+from injection import SMALL, SMALL_FLAT, differences, finish, run, spawn, the_run, wait
 
 from sb3_tbc.errors import ConfigError, FolderInUseError
 from sb3_tbc.files import locked
+from sb3_tbc.zoo import callbacks
 from sb3_tbc.zoo.checkpoints import find_checkpoint
 
 ARGUMENTS = ["--env", "Pendulum", "--n-timesteps", 1500, "--eval-freq", 500, "--trace", "--keep-checkpoint", *SMALL]
@@ -48,6 +51,45 @@ def test_stopped_by_a_signal(number: int, undisturbed: Path, tmp_path: Path) -> 
     assert stopped is not None
     assert 500 <= stopped.timesteps < 1500
     assert not differences(undisturbed, finish(tmp_path / "runs", arguments, tmp_path / "log"))
+
+
+def stop_in_evaluation(number: int) -> Callable[[], None]:
+    """For ``before``: ask for a stop while the ``number``-th evaluation within training begins its episodes."""
+
+    def install() -> None:
+        evaluate, seen = callbacks.evaluate_agent, 0
+
+        def watched(*arguments: Any, **options: Any) -> Any:
+            nonlocal seen
+            seen += 1
+            if seen == number:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return evaluate(*arguments, **options)
+
+        callbacks.evaluate_agent = watched  # type: ignore[assignment]
+
+    return install
+
+
+@pytest.mark.parametrize("algo", ["tbc-hrl", "sac"])
+def test_an_evaluation_is_given_up_and_done_by_the_resumed_run(algo: str, tmp_path: Path) -> None:
+    """At the first and the last, and again where the resumed run makes up for it: nothing is left out or changed."""
+    small = SMALL_FLAT if algo == "sac" else SMALL
+    arguments = ["--algo", algo, "--env", "faulty:FaultyCorridor-v0", "--n-timesteps", 400, "--eval-freq", 200, *small]
+    arguments += ["--trace", "--keep-checkpoint", "--log-folder"]
+    log = tmp_path / "log"
+    assert run([*arguments, tmp_path / "whole"], log) == 0, log.read_text()
+    assert run([*arguments, tmp_path / "runs"], log, stop_in_evaluation(1)) == 130
+    whole, folder = the_run(tmp_path / "whole"), the_run(tmp_path / "runs")
+    assert whole is not None
+    assert folder is not None
+    assert len((folder / "evaluations.csv").read_text().splitlines()) == 1
+    resume = ["--resume", folder, "--trace", "--keep-checkpoint", "--no-progress"]
+    for number, rows in ((2, 1), (1, 1)):
+        assert run(resume, log, stop_in_evaluation(number)) == 130
+        assert len((folder / "evaluations.csv").read_text().splitlines()) == 1 + rows
+    assert run(resume, log) == 0, log.read_text()
+    assert not differences(whole, folder)
 
 
 def test_a_damaged_checkpoint_is_named_and_the_one_before_is_taken(
