@@ -124,7 +124,8 @@ def _job(args: argparse.Namespace, run: RunConfig, env: str, seed: int, ablation
         RunFolder.for_run(root.absolute(), run.task, run.algo, variant, seed) for root in (args.log_folder, args.ledger)
     )
     episodes = evaluated_episodes(args, run.n_timesteps)
-    return Job(run.algo, env, seed, folder, target, tuple(arguments), run.n_timesteps, episodes)
+    final = args.n_final_episodes
+    return Job(run.algo, env, seed, folder, target, tuple(arguments), run.n_timesteps, episodes, final)
 
 
 def wanted_run(job: Job) -> RunSpec:

@@ -88,8 +88,8 @@ def hours_of(job: Job, speeds: Speeds) -> float | None:
     left = job.steps_left / job.n_timesteps if job.n_timesteps else 1.0
     key = _measured(job, speeds)
     if key is not None:
-        evaluated = job.n_episodes * _episode(job, speeds) / speeds.evaluate[key]
-        return left * (job.n_timesteps / speeds.train[key] + evaluated) / 3600
+        evaluated = job.episodes_left * _episode(job, speeds) / speeds.evaluate[key]
+        return (left * job.n_timesteps / speeds.train[key] + evaluated) / 3600
     speed = _of_task(job, speeds.whole)
     return left * job.n_timesteps / speed / 3600 if speed else None
 

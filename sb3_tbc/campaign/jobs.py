@@ -15,7 +15,7 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json
 from sb3_tbc.zoo.checkpoints import steps_done
 from sb3_tbc.zoo.ledger import RunFolder, to_json
-from sb3_tbc.zoo.runner import RunSpec
+from sb3_tbc.zoo.runner import RunSpec, trained_steps
 
 FAILED = "failed.json"
 """File in the ledger's folder of a failed run: exit status, number of attempts and last message."""
@@ -33,6 +33,7 @@ class Job:
     :param arguments: for ``python -m sb3_tbc.train``
     :param n_timesteps: environment steps of the run
     :param n_episodes: episodes of all its evaluations together
+    :param n_final_episodes: those of them that follow training
     :param cwd: working directory of the command; folders in ``arguments`` are relative to it
     """
 
@@ -44,6 +45,7 @@ class Job:
     arguments: tuple[str, ...]
     n_timesteps: int = 0
     n_episodes: int = 0
+    n_final_episodes: int = 0
     cwd: Path = field(default_factory=Path.cwd)
 
     @property
@@ -75,10 +77,20 @@ class Job:
 
     @property
     def steps_left(self) -> int:
-        """Environment steps still to do: of a stopped run those after its checkpoint, of a finished one none."""
+        """Environment steps still to do: of a stopped run those after its checkpoint, of a trained one none."""
         if self.folder.finished:
             return 0
-        return max(self.n_timesteps - steps_done(self.folder.path), 0) if self.folder.resumable else self.n_timesteps
+        if not self.folder.resumable:
+            return self.n_timesteps
+        return max(self.n_timesteps - max(steps_done(self.folder.path), trained_steps(self.folder)), 0)
+
+    @property
+    def episodes_left(self) -> float:
+        """Episodes of evaluations still to come: those within the steps that are left, and those after training."""
+        if self.folder.finished:
+            return 0.0
+        left = self.steps_left / self.n_timesteps if self.n_timesteps else 1.0
+        return left * (self.n_episodes - self.n_final_episodes) + self.n_final_episodes
 
     def require(self, wanted: RunSpec) -> None:
         """Refuse a folder with another run: its result is none of the campaign's.

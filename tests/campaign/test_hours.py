@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -73,6 +74,26 @@ def test_of_a_stopped_run_the_rest_counts(tmp_path: Path) -> None:
         "0 of 1,000 steps left, 0.00 h",
         "1,000 steps, 1.00 h",
     ]
+
+
+def test_the_evaluation_after_training_counts_until_it_is_done(tmp_path: Path) -> None:
+    """Also of a run that lacks nothing else, which has its agent, and a checkpoint of before or none."""
+    rows = {("Pendulum", "hits"): 1.0}
+    speeds = Speeds(rows, rows, {("Pendulum", "hits"): 10.0}, {})
+    fresh, stopped, trained, finished = (
+        replace(make_job(tmp_path, seed), n_episodes=300, n_final_episodes=100) for seed in range(4)
+    )
+    for job in (stopped, trained, finished):
+        job.folder.start({}, "x")
+        job.folder.checkpoint.mkdir()
+        (job.folder.checkpoint / "state.json").write_text('{"timesteps": 750}')
+    for job in (trained, finished):
+        with zipfile.ZipFile(job.folder.model, "w") as file:
+            file.writestr("data", '{"num_timesteps": 1000}')
+    finished.folder.finish({})
+    seconds = [3600 * (hours_of(job, speeds) or 0.0) for job in (fresh, stopped, trained, finished)]
+    assert seconds == pytest.approx([1000 + 3000, 250 + 500 + 1000, 1000, 0])
+    assert plan([trained], 1, speeds)[0].endswith("0 of 1,000 steps left, 0.28 h")
 
 
 def test_hours_without_evaluations_are_not_said_to_include_them(tmp_path: Path) -> None:
