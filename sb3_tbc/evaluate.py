@@ -165,11 +165,11 @@ def _watch(
     :raises ConfigError: if the environment cannot be drawn, or there is no display
     """
     from sb3_tbc.tasks.window import Window
-    from sb3_tbc.zoo.video import episode_frames
+    from sb3_tbc.zoo.video import episode_frames, frames_per_second
 
     model, env = load_model(path, device=device, trust=trust), make_env(info["env_id"], **info["env_kwargs"])
     try:
-        window = Window(f"{info['task']}, {info['algo']}", env.metadata.get("render_fps", 30))
+        window = Window(f"{info['task']}, {info['algo']}", frames_per_second(env))
         for episode in range(n_episodes):
             for frame in episode_frames(model, env, seed + episode, not stochastic):
                 window.show(frame)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import numbers
+import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -24,6 +26,8 @@ from sb3_tbc.tbc_hrl.evaluation import Agent
 from sb3_tbc.tbc_hrl.policy import TwoLevelState
 
 Frame = NDArray[np.uint8]
+MUJOCO_DRAWING = ("mujoco.", "glfw.", "OpenGL.", "gymnasium.envs.mujoco.mujoco_rendering.")
+"""Modules that draw for MuJoCo's environments."""
 OUTCOME_SECONDS = 1.5
 """How long the last picture of an episode stays, so that its outcome can be read."""
 
@@ -49,8 +53,16 @@ def film(model: Agent, env: Env, seed: int | None = None, deterministic: bool = 
 
 
 def frames_per_second(env: Env) -> float:
-    """How many steps of the task make up one second of video."""
-    return float(env.metadata.get("render_fps", 30))
+    """How many steps of the task make up one second of video; 30 where it does not say.
+
+    :raises ConfigError: for a ``render_fps`` that no film can have
+    """
+    rate = env.metadata.get("render_fps")
+    if rate is None:  # some environments say so
+        return 30.0
+    if isinstance(rate, bool) or not isinstance(rate, numbers.Real) or not 0 < rate < math.inf:
+        raise ConfigError(f"the environment's metadata['render_fps'] must be a number above 0, got {one_line(rate)}")
+    return float(rate)
 
 
 def episode_frames(model: Agent, env: Env, seed: int | None = None, deterministic: bool = True) -> Iterator[Frame]:
@@ -98,14 +110,20 @@ def _frame(env: Env, shown: Overlay, observation: PlainMapping) -> Frame:
     try:
         rendered = env.render()
     except Exception as error:  # An environment's own code may fail in any way.
-        cure = "" if "MUJOCO_GL" in str(error) else "; without a display, set MUJOCO_GL=egl or MUJOCO_GL=osmesa"
-        raise ConfigError(f"the environment cannot be drawn: {error}{cure}") from error
+        cure = "; without a display, set MUJOCO_GL=egl or MUJOCO_GL=osmesa" if _lacks_display(error) else ""
+        raise ConfigError(f"the environment cannot be drawn: {one_line(error, 1000)}{cure}") from error
     picture = _picture(rendered)
     if not draws_itself:
         picture = with_caption(picture, shown, np.asarray(observation["desired_goal"], dtype=np.float64))
     height, width = picture.shape[:2]
     frame: Frame = picture[: height - height % 2, : width - width % 2]  # the codec needs even sizes
     return frame
+
+
+def _lacks_display(error: Exception) -> bool:
+    """Whether an error comes out of MuJoCo's drawing, which needs another backend, and does not say so itself."""
+    modules = (frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__))
+    return "MUJOCO_GL" not in str(error) and any(f"{name}.".startswith(MUJOCO_DRAWING) for name in modules)
 
 
 def _picture(rendered: object) -> Frame:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +15,7 @@ from sb3_tbc.tasks.rendering import SUBGOAL
 from sb3_tbc import TBCHRL, evaluate
 from sb3_tbc.errors import ConfigError, WriteError
 from sb3_tbc.extras import MissingExtraError
-from sb3_tbc.zoo.video import episode_frames, film, record_video, require_film
+from sb3_tbc.zoo.video import episode_frames, film, frames_per_second, record_video, require_film
 
 ENV_ID = "sb3_tbc/Drawbridge-v0"
 
@@ -133,9 +134,26 @@ def test_a_film_that_cannot_be_written_costs_one_line(model: TBCHRL, tmp_path: P
 def test_what_cannot_be_drawn_costs_one_line(model: TBCHRL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("imageio_ffmpeg")
     env = gym.make(ENV_ID, render_mode="rgb_array")
-    for picture, message in ((lambda: None, "render_mode"), (lambda: 1 / 0, "division by zero; .* MUJOCO_GL=egl")):
+    failing: Any = lambda: 1 / 0  # noqa: E731
+    of_mujoco = FunctionType(failing.__code__, {"__name__": "mujoco.egl"})
+    cases = (lambda: None, "render_mode"), (failing, "division by zero$"), (of_mujoco, "zero; .* MUJOCO_GL=osmesa")
+    for picture, message in cases:
         monkeypatch.setattr(env.unwrapped, "render", picture)
         with pytest.raises(ConfigError, match=f"cannot be drawn: .*{message}"):
+            record_video(model, env, tmp_path / "a.mp4")
+    assert not list(tmp_path.iterdir())
+
+
+def test_rates_of_pictures(model: TBCHRL, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Thirty a second where the environment does not say; one that no film can have costs one line."""
+    pytest.importorskip("imageio_ffmpeg")
+    env = Painter(64)
+    for rate in ({}, {"render_fps": None}):
+        monkeypatch.setattr(Painter, "metadata", rate)
+        assert frames_per_second(env) == 30.0
+    for wrong in (0, -5, "fast", float("nan"), float("inf")):
+        monkeypatch.setattr(Painter, "metadata", {"render_fps": wrong})
+        with pytest.raises(ConfigError, match=rf"'render_fps'\] must be a number above 0, got {wrong}"):
             record_video(model, env, tmp_path / "a.mp4")
     assert not list(tmp_path.iterdir())
 
