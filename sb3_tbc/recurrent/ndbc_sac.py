@@ -24,7 +24,7 @@ from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.ndbc.extractor import input_scale_of
 from sb3_tbc.recurrent.cells import NDBCCell, make_cell
-from sb3_tbc.recurrent.sequences import SequenceReplayBuffer, Sequences, flat, flat_space
+from sb3_tbc.recurrent.sequences import SequenceReplayBuffer, Sequences, flat, flat_space, refuse_non_finite
 from sb3_tbc.tbc_hrl.environment import episode_starts
 from sb3_tbc.tbc_hrl.last_step import KeepsLastStep
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
@@ -174,9 +174,11 @@ class RecurrentSACPolicy(SACPolicy):
         :param episode_start: ``(n_envs,)``, in which environments an episode begins; by default in none
         :param deterministic: the squashed mean in place of a sample
         :raises ValueError: if observation or state do not fit
+        :raises NonFiniteError: if an observation is NaN or infinite
         """
         self.set_training_mode(False)
         flat_observation = self._flat(observation)
+        refuse_non_finite("observation", flat_observation)
         memory, last_action = self._checked(state, len(flat_observation))
         if episode_start is not None:
             fresh = episode_starts(episode_start, len(memory))[:, None]

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tbc.aliases import Space
 from sb3_tbc.arrays import AnyArray, BoolArray, Float32
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, NonFiniteError
 from sb3_tbc.files import write_arrays
 from sb3_tbc.reading import read_arrays
 
@@ -52,6 +52,17 @@ def flat(observation: Any, space: Space) -> Float32:
     is_dict = isinstance(space, spaces.Dict)
     pairs = [(observation[key], box) for key, box in space.spaces.items()] if is_dict else [(observation, space)]  # type: ignore[attr-defined]
     return np.concatenate([_rows(part, box.shape) for part, box in pairs], axis=1)
+
+
+def refuse_non_finite(what: str, rows: AnyArray) -> None:
+    """Refuse what is NaN or infinite: it would spread into all weights.
+
+    :param rows: of every environment, ``(n_envs, width)``
+    :raises NonFiniteError: naming the environment
+    """
+    if not np.isfinite(rows).all():
+        index = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
+        raise NonFiniteError(f"environment {index}: its {what} is not finite: {rows[index].tolist()}")
 
 
 def _rows(part: Any, shape: tuple[int, ...] | None) -> Float32:
@@ -110,9 +121,16 @@ class SequenceReplayBuffer(ReplayBuffer):
         """Say in which environments the transition that is added next begins an episode, ``(n_envs,)``."""
         self.starts[self.pos] = starts
 
-    def add(self, obs: Any, next_obs: Any, *args: Any) -> None:
-        """Add a transition of every environment, see SB3; :meth:`note_starts` comes before it."""
-        super().add(flat(obs, self.given_space), flat(next_obs, self.given_space), *args)
+    def add(self, obs: Any, next_obs: Any, action: AnyArray, reward: AnyArray, *args: Any) -> None:
+        """Add a transition of every environment, see SB3; :meth:`note_starts` comes before it.
+
+        :raises NonFiniteError: if the environments gave what is not finite; nothing is added then
+        """
+        seen, then = (flat(part, self.given_space) for part in (obs, next_obs))
+        refuse_non_finite("observation", seen)
+        refuse_non_finite("observation", then)
+        refuse_non_finite("reward", np.asarray(reward).reshape(-1, 1))
+        super().add(seen, then, action, reward, *args)
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> ReplayBufferSamples:
         """Uniformly drawn sequences; all but the observations is of the steps that are learnt from, one after another.
