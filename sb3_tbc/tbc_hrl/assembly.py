@@ -11,6 +11,7 @@ from gymnasium import spaces
 from sb3_tbc.aliases import Plain
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
+from sb3_tbc.settings import SettingError
 from sb3_tbc.smdp.bounds import RewardRange, ValueBounds, high_level_bounds, low_level_bounds
 from sb3_tbc.smdp.hindsight import HindsightSettings
 from sb3_tbc.smdp.options import OptionRules
@@ -205,6 +206,25 @@ def _make_level(
 
 
 # -------------------------------------------------------------------------------------------------- replay
+
+
+def refuse_small_buffers(config: TBCConfig, episode_length: int | None) -> None:
+    """Refuse, before any step, buffers that do not hold what one episode may give: learning would end at that episode.
+
+    :param episode_length: time limit of the task, environment steps; None where it has none
+    :raises SettingError: naming the level and the smallest size
+    """
+    copies = (
+        2 + config.keep_original + config.n_hindsight_goals
+    )  # a failed test, in hindsight, as chosen, for each goal
+    rows = {"high": int(config.max_options) * copies, "low": episode_length or 0}
+    for name, size in (("high", config.high.buffer_size), ("low", config.low.buffer_size)):
+        if size < rows[name]:
+            raise SettingError(
+                f"{name}.buffer_size",
+                f"of {size} does not hold an episode, which may give the {name} level {rows[name]} transitions here: "
+                "raise it to that at least",
+            )
 
 
 def make_high_buffer(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal, Self
 
 from sb3_tbc.settings import Range, SettingError, Settings
+from sb3_tbc.tbc_hrl.idle_settings import idle_in_actor, idle_in_agent
 from sb3_tbc.tbc_hrl.level_config import (
     CircuitConfig,
     Fraction,
@@ -203,6 +204,12 @@ class TBCConfig(AgentConfig):
                 f"{self.low.goal_strategy!r} has an effect with low_reward='step' alone, here it is "
                 f"{self.low_reward!r}: hindsight subgoals that depend on time come from the same window",
             )
+        if self.low.policy_kwargs.negative_critic and self.low_reward != "step":
+            raise SettingError(
+                "low.policy_kwargs.negative_critic",
+                f"keeps the critic's values below zero, but a subgoal reached is worth 1 with low_reward="
+                f"{self.low_reward!r}, so nothing would be learnt: leave it out, or use low_reward='step'",
+            )
         if self.high.policy_kwargs.negative_critic and self.bonus_beyond_cost:
             price = f"decision_cost={self.decision_cost:g}" if self.target == "smdp" else "target='decision'"
             raise SettingError(
@@ -224,7 +231,14 @@ class TBCConfig(AgentConfig):
         return self.completion_bonus > (self.decision_cost if self.target == "smdp" else 0.0)
 
     def warn_before_learning(self) -> None:
-        """Say so where a replay buffer holds less than a batch: its level would never be updated."""
+        """Name idle settings, and replay buffers that hold less than a batch: their level would never be updated."""
+        tests = self.testing_penalty is not None, self.deterministic_testing
+        idle = [
+            *idle_in_agent(self.window_end, self.reconsider_margin, self.testing_fraction, *tests),
+            *idle_in_actor(self.low.policy_kwargs, self.memory),
+        ]
+        for sentence in idle:
+            warnings.warn(sentence, stacklevel=3)
         for name, level in (("high", self.high), ("low", self.low)):
             if level.buffer_size < level.batch_size:
                 warnings.warn(

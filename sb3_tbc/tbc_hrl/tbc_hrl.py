@@ -279,6 +279,7 @@ class TBCHRL(TwoLevelSaving):
         :raises TypeError: if ``total_timesteps`` is not a whole number
         """
         self._refuse_foreign_high("learn")
+        assembly.refuse_small_buffers(self.config, self.episode_length)
         self.config.warn_before_learning()
         total_timesteps = calls.whole_steps(total_timesteps)
         if self.env is None:

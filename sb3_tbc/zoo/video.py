@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import numbers
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import closing
@@ -60,7 +59,7 @@ def frames_per_second(env: Env) -> float:
     rate = env.metadata.get("render_fps")
     if rate is None:  # some environments say so
         return 30.0
-    if isinstance(rate, bool) or not isinstance(rate, numbers.Real) or not 0 < rate < math.inf:
+    if isinstance(rate, bool) or not isinstance(rate, int | float | np.number) or not 0 < rate < math.inf:
         raise ConfigError(f"the environment's metadata['render_fps'] must be a number above 0, got {one_line(rate)}")
     return float(rate)
 

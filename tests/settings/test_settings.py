@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import itertools
 import json
 import math
+import re
 import subprocess
 import sys
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -25,7 +28,9 @@ from sb3_tbc.tbc_hrl.config import FlatConfig, HACConfig, HiTSConfig, TBCConfig
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.level_config import HighConfig, LowConfig, LowPolicyConfig
 from sb3_tbc.zoo import schema
-from sb3_tbc.zoo.config import load_config, nested, parse_overrides
+from sb3_tbc.zoo.algorithms import algorithm
+from sb3_tbc.zoo.config import CONFIGS, load_config, nested, parse_overrides
+from sb3_tbc.zoo.environments import task_names
 from sb3_tbc.zoo.settings_page import settings_markdown, settings_text
 
 ALL = {"tbc-hrl": TBCConfig, "hits": HiTSConfig, "hac": HACConfig, "sac": FlatConfig}
@@ -276,6 +281,73 @@ def test_a_bonus_and_a_critic_that_cannot_be_positive_exclude_each_other(given: 
             TBCHRL("MultiInputPolicy", Corridor(), high=high, **given)
     else:
         assert TBCHRL("MultiInputPolicy", Corridor(), high=high, compile=False, **given).high.policy.critic.negative
+
+
+@pytest.mark.parametrize(
+    ("given", "named"),
+    [
+        ({"low": {"policy_kwargs": {"ndbc": None}}, "memory": "window"}, "memory='window' .* is an MLP"),
+        ({"reconsider_margin": 0.5}, "reconsider_margin=0.5 .* window_end='timed'"),
+        ({"testing_fraction": 0.0, "testing_penalty": -1.0}, "testing_penalty has no effect"),
+        ({"testing_fraction": 0.0, "deterministic_testing": True}, "deterministic_testing has no effect"),
+        (
+            {"low": {"policy_kwargs": {"ndbc": {"adaptive_step": {"relative_tolerance": 0.1}}}}},
+            "adaptive_step.relative_tolerance=0.1 .* half_step_check",
+        ),
+        ({"low": {"policy_kwargs": {"ndbc": None, "gru": 4}}, "memory": "window"}, ""),
+        ({"window_end": "reconsider", "reconsider_margin": 0.5, "testing_penalty": -1.0}, ""),
+    ],
+)
+def test_settings_that_change_nothing_are_named_before_learning(given: dict[str, Any], named: str) -> None:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        TBCConfig.from_dict(given).warn_before_learning()
+    assert len(said) == bool(named)
+    assert all(re.search(named, str(warning.message)) for warning in said)
+
+
+@pytest.mark.parametrize("algo", ["tbc-hrl", "hits", "hac"])
+def test_no_shipped_setting_changes_nothing(algo: str) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for task, config in itertools.product((*task_names(), "PointMaze"), CONFIGS):
+            settings = {k: v for k, v in load_config(algo, task, config).model.items() if k != "policy"}
+            algorithm(algo).config_class.from_dict(settings).warn_before_learning()  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"low": {"buffer_size": 49, "batch_size": 8}}, r"low\.buffer_size of 49 .* 50 transitions"),
+        ({"high": {"buffer_size": 24, "batch_size": 8}}, r"high\.buffer_size of 24 .* 25 transitions"),
+    ],
+)
+def test_buffers_that_an_episode_may_overflow_are_refused_before_any_step(given: dict[str, Any], message: str) -> None:
+    model = TBCHRL("MultiInputPolicy", Corridor(), max_options=5, compile=False, **given)
+    with pytest.raises(ConfigError, match=message):
+        model.learn(10)
+    assert model.num_timesteps == 0
+
+
+def test_the_fullest_episode_fits_the_smallest_buffers() -> None:
+    """Each option a failed test, nothing reached, time used up: the most rows that there can be."""
+    sizes = {level: {"buffer_size": size, "batch_size": 8} for level, size in (("high", 30), ("low", 50))}
+    env = Corridor(goal=5.0)
+    tested: dict[str, Any] = {"duration": "fixed", "testing_fraction": 1.0, "keep_original": True, **sizes}
+    model = TBCHRL("MultiInputPolicy", env, max_options=5, goal_strategy="episode", gradient_ratio=0.0, **tested)
+    model.learn(150)
+    assert model.num_timesteps == 150
+    assert all(buffer.full for buffer in model.replay_buffer)
+
+
+@pytest.mark.parametrize("reward", ["sparse", "dense", "step"])
+def test_a_low_level_that_is_rewarded_has_no_negative_critic(reward: str) -> None:
+    given = {"low_reward": reward, "low": {"policy_kwargs": {"negative_critic": True}}}
+    if reward == "step":
+        assert TBCConfig.from_dict(given).low.policy_kwargs.negative_critic
+        return
+    with pytest.raises(ConfigError, match=rf"low.policy_kwargs.negative_critic keeps .* low_reward='{reward}'"):
+        TBCConfig.from_dict(given)
 
 
 def test_mappings_dataclasses_and_numpy_numbers_are_taken() -> None:
