@@ -302,7 +302,8 @@ def summarise(study: Study, settings: StudySettings, folder: Path) -> None:
         print(f"note           all {len(done)} trials have the same value; a larger --n-timesteps may tell them apart")
     print(f"best           {settings.objective} {best.value:.4g}   (trial {best.number})")
     print(f"settings       {path}")
-    again = shlex.join(train_arguments(settings, path, settings.first_seed, {}))
+    episodes = {"n_final_episodes": settings.n_final_episodes}  # so that it ends in the trial's own value, too
+    again = shlex.join(train_arguments(settings, path, settings.first_seed, episodes))
     print(f"its curve      {python()} -m sb3_tbc.train {again}")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -29,8 +30,9 @@ from sb3_tbc.tune import trial as trials
 from sb3_tbc.tune import worker
 from sb3_tbc.tune.results import difference, find_trial, write_trial
 from sb3_tbc.tune.study import ORIGIN, REASON, open_storage, read_settings
-from sb3_tbc.zoo.callbacks import SuccessEvalCallback, read_evaluations
+from sb3_tbc.zoo.callbacks import SuccessEvalCallback
 from sb3_tbc.zoo.config import load_config
+from sb3_tbc.zoo.ledger import RunFolder
 
 ENV = "tuned_corridor:TunedCorridor-v0"
 TINY = [
@@ -115,19 +117,21 @@ def test_what_is_left_behind(searched: Path) -> None:
     assert not list(folder.rglob("checkpoint*"))
 
 
-def test_the_best_trial_trains_again_to_the_same_curve(searched: Path, tmp_path: Path) -> None:
-    study = load(searched)
-    best = study.best_trial
-    path = searched / NAME / "best.yml"
-    section = yaml.safe_load(path.read_text())["TunedCorridor-v0"]
-    assert section["n_timesteps"] == 200
-    config = ["--config", str(path), "--eval-freq", "100", "--n-eval-episodes", "2", "--n-final-episodes", "2"]
-    where = ["--log-folder", str(tmp_path), "--variant", "best", "--no-progress"]
-    assert train.main(["--env", ENV, *config, "--seed", "1", *where]) == 0
-    again = read_evaluations(tmp_path / "TunedCorridor-v0" / "tbc-hrl" / "best" / "seed_1" / "evaluations.csv")
-    first = read_evaluations(searched / NAME / f"trial_{best.number:04d}" / "seed_1" / "evaluations.csv")
-    assert [row._replace(wall_time=0) for row in again] == [row._replace(wall_time=0) for row in first]
-    assert again
+def test_the_printed_command_trains_the_best_trial_again(
+    searched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert yaml.safe_load((searched / NAME / "best.yml").read_text())["TunedCorridor-v0"]["n_timesteps"] == 200
+    assert tune.main(arguments(searched, "--n-trials", "3")) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("its curve"))
+    command = shlex.split(line.partition("sb3_tbc.train")[2])
+    assert train.main([*command, "--log-folder", str(tmp_path), "--no-progress"]) == 0
+    again = RunFolder(tmp_path / "TunedCorridor-v0" / "tbc-hrl" / "best" / "seed_0")
+    first = RunFolder(searched / NAME / f"trial_{load(searched).best_trial.number:04d}" / "seed_0")
+    rows, wanted = ([row._replace(wall_time=0) for row in run.read_evaluations()] for run in (again, first))
+    assert rows == wanted
+    assert rows
+    for figure in ("success_rate", "n_episodes", "eval_seed"):  # what the objective `success` is made of
+        assert again.read_final()[figure] == first.read_final()[figure]
 
 
 @pytest.mark.parametrize("which", ["0", "1", "best"])
