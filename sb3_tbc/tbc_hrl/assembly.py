@@ -214,9 +214,8 @@ def refuse_small_buffers(config: TBCConfig, episode_length: int | None) -> None:
     :param episode_length: time limit of the task, environment steps; None where it has none
     :raises SettingError: naming the level and the smallest size
     """
-    copies = (
-        2 + config.keep_original + config.n_hindsight_goals
-    )  # a failed test, in hindsight, as chosen, for each goal
+    # of each option: a failed test, the copy in hindsight, the original, and one for each hindsight goal
+    copies = 2 + config.keep_original + config.n_hindsight_goals
     rows = {"high": int(config.max_options) * copies, "low": episode_length or 0}
     for name, size in (("high", config.high.buffer_size), ("low", config.low.buffer_size)):
         if size < rows[name]:
