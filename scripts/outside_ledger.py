@@ -27,7 +27,7 @@ Command = Sequence[str]
 
 
 def searches() -> list[Command]:
-    """Both searches, as docs/tuning.md and results/notes/pendulum.md describe them."""
+    """Both searches, as results/notes/searches.md and results/notes/pendulum.md describe them."""
     shared = ("--n-seeds", "2", "--first-seed", "100", "--search-space")
     ur5 = ("--env", "UR5Reacher", "--n-trials", "35", "--n-timesteps", "45000", "--eval-freq", "5000", *shared,
            "results/searches/ur5reacher.yml", "--search", *SEARCHED, "batch_size")  # fmt: skip
