@@ -82,7 +82,7 @@ def _shipped_circuit(task: str, config: str) -> ShippedCircuit:
 def parameters() -> tuple[list[str], Plain]:
     """The shipped circuits as SAC actors of the low level, beside the MLP of the task's configuration."""
     lines = [
-        "| task | neurons | synapses | NDBC actor | MLP it replaces | MLP actor | share |",
+        "| task | neurons | synapses | parameters, circuit | hidden layers of the MLP | parameters, MLP | circuit / MLP |",
         "|---|---|---|---|---|---|---|",
     ]
     rows = []
