@@ -202,8 +202,8 @@ def page(rows: Sequence[tuple[str, str]], skipped: Sequence[str], missing: int, 
         "trained for 1,500 steps with tiny settings, was evaluated, filmed and exported, or was refused in one\n"
         "line that says why. One id stands for its family and kind of reward; the second column counts the ids\n"
         "like it. *exports* gives the largest difference between the actions of the exported NumPy policy and the\n"
-        "agent's. How to use such an environment: [Add your own task](your_task.md). `python\n"
-        "scripts/goal_environments.py --output docs/goal_environments.md` makes this page.\n"
+        "agent's. How to use such an environment: [Add your own task](your_task.md).\n"
+        "`python scripts/goal_environments.py --output docs/goal_environments.md` makes this page.\n"
     )
     parts = [head, f"\n{said}\n"] if said else [head]
     for module, package in PACKAGES.items():
