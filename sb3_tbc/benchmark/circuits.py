@@ -82,7 +82,7 @@ def _shipped_circuit(task: str, config: str) -> ShippedCircuit:
 def parameters() -> tuple[list[str], Plain]:
     """The shipped circuits as SAC actors of the low level, beside the MLP of the task's configuration."""
     lines = [
-        "| task | neurons | synapses | parameters, circuit | hidden layers of the MLP | parameters, MLP | circuit / MLP |",
+        "| task | neurons | synapses | circuit, parameters | MLP, hidden layers | MLP, parameters | circuit / MLP |",
         "|---|---|---|---|---|---|---|",
     ]
     rows = []
