@@ -29,7 +29,7 @@ def push_to_hub(
     token: str | None = None,
     private: bool = False,
 ) -> str:
-    """Put an agent and its model card into a repository of the Hub, which is made if need be.
+    """Upload an agent and its model card to a repository of the Hugging Face Hub, which is made if need be.
 
     :param agent: an agent, or a ``.zip`` that one was saved to
     :param repo_id: ``"owner/name"``
@@ -99,7 +99,7 @@ def download_from_hub(repo_id: str, filename: str = MODEL) -> Path:
 def load_from_hub(
     repo_id: str, filename: str = MODEL, env: Any = None, device: str = "cpu", trust: bool = False
 ) -> Agent:
-    """An agent of the Hub. What a stranger has put there runs no code, unless you say that you trust it.
+    """Load an agent from the Hugging Face Hub. A stranger's file runs no code, unless you say that you trust it.
 
     Agents of :class:`~sb3_tbc.recurrent.NDBCSAC` are loaded by ``NDBCSAC.load(download_from_hub(...))``.
 

@@ -1,8 +1,8 @@
 """``python -m sb3_tbc.reproduce``: the paper's experiments, on this machine, as jobs of Slurm, or on a Ray cluster.
 
-Results go to the ledger. A stopped campaign is continued by the same command: finished runs are never repeated; failed
-ones are recorded in the ledger, counted, and tried again. A run in the log folder that was made with other settings is
-neither continued nor copied; where the ledger has one, nothing begins.
+Results go to the ledger, a folder of small result files. The same command continues what was stopped: finished runs are
+never repeated; failed ones are recorded in the ledger, counted, and tried again. A run in the log folder that was made
+with other settings is neither continued nor copied; if the ledger has such a run, nothing begins.
 """
 
 from __future__ import annotations
@@ -70,7 +70,11 @@ def build_parser() -> Parser:
         choices=CONFIGS,
         help="which values to use; by default tuned, for tasks that have them",
     )
-    add("--ablation", choices=sorted(ABLATIONS), help="what to leave out; needs --algos tbc-hrl")
+    add(
+        "--ablation",
+        choices=sorted(ABLATIONS),
+        help="a part of the method to leave out (no-...) or to put in (with-...); needs --algos tbc-hrl",
+    )
     add("--ablations", action="store_true", help="every ablation that changes something in a task's settings; "
         "needs --algos tbc-hrl")  # fmt: skip
     add("--variant", help="name of the runs' folder; by default as in sb3_tbc.train")

@@ -75,9 +75,8 @@ def build_parser() -> Parser:
                       "with sections like those of zoo_configs")  # fmt: skip
     what.add_argument("--config-file", type=Path, metavar="FILE.yml", help="a configuration file of your own; --config "
                       "says which of its values to use, paper or tuned")  # fmt: skip
-    what.add_argument(
-        "--ablation", metavar="NAME", help=f"leave a part of the method out, or put one in: {', '.join(ABLATIONS)}"
-    )
+    what.add_argument("--ablation", metavar="NAME", help="leave a part of the method out (no-ts: timed windows, "
+                      f"no-ndbc: the circuit), or put one in (with-...): {', '.join(ABLATIONS)}")  # fmt: skip
     what.add_argument("--hyperparams", action=Several, default=[], metavar="NAME:VALUE", help="single settings, which "
                       "win over the configuration; dots lead into a level, e.g. low.learning_rate:1e-3")  # fmt: skip
     what.add_argument("--on-bad-step", choices=["stop", "end-episode"], help="what follows where the environment "

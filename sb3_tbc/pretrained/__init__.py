@@ -33,7 +33,7 @@ def pretrained_path(name: str) -> Path:
 
 
 def load_pretrained(name: str, env: Any = None, device: str = "cpu") -> Agent:
-    """A trained agent.
+    """Load a trained agent that comes with the package.
 
     :param name: a task's short name, e.g. ``"Pendulum"``
     :param env: environments to act in, for further training

@@ -242,7 +242,7 @@ class RecurrentSACPolicy(SACPolicy):
 
 
 class NDBCSAC(PlainAlgorithm, KeepsLastStep, SAC):
-    """Recurrent SAC for tasks that do not show everything: SB3's SAC, learning from sequences.
+    """Recurrent SAC for tasks whose observation hides a part of the state: SB3's SAC, learning from sequences.
 
     The actor's memory is an NDBC circuit, or a GRU, LTC or CfC cell; it also sees its last action. Memories are
     unrolled through the sequences that are replayed and learn by backpropagation through time. Use it as any SB3

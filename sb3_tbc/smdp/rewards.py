@@ -1,4 +1,4 @@
-"""What the low level is rewarded for: the degree to which its subgoal is completed. NumPy only."""
+"""What each level is rewarded for, and the high level's discount. NumPy only."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class TwoLevelState(NamedTuple):
 
 
 class TBCPolicy(BasePolicy):
-    """Both levels as one policy.
+    """Both levels as one policy: :meth:`predict` takes the task's observation and returns the task's action.
 
     :param observation_space: the task's goal observation
     :param action_space: the task's action box

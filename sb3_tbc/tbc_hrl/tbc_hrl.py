@@ -54,8 +54,9 @@ MIN_UPDATES_TO_COMPILE = 3000
 
 
 class TBCHRL(TwoLevelSaving):
-    """Timed and bionic circuit hierarchical reinforcement learning (Li, Shan, Mo 2025), two SAC levels.
+    """Timed and bionic circuit hierarchical reinforcement learning (Li, Shan, Mo 2025).
 
+    Two levels of SAC: the high level chooses a subgoal and a time budget, the low level acts until the time is spent.
     Settings are given by name, see :class:`~sb3_tbc.tbc_hrl.config.TBCConfig`; those of a level as ``high={...}`` and
     ``low={...}``, see :class:`~sb3_tbc.tbc_hrl.level_config.HighConfig` and
     :class:`~sb3_tbc.tbc_hrl.level_config.LowConfig`::
