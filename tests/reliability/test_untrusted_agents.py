@@ -53,7 +53,7 @@ def pickled(mark: Path) -> bytes:
 def agent(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small agent, saved."""
     path = tmp_path_factory.mktemp("agent") / "model.zip"
-    small = {"batch_size": 8, "buffer_size": 100}
+    small = {"batch_size": 8, "buffer_size": 1000}
     env = make_envs("sb3_tbc/Pendulum-v0", 1, 0)
     model = TBCHRL("MultiInputPolicy", env, high=small, low=small, compile=False, seed=0)
     model.run_info = {"algo": "tbc-hrl", "task": "Pendulum", "env_id": "sb3_tbc/Pendulum-v0", "env_kwargs": {}}
