@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from numbers import Integral
 from typing import Any, NamedTuple, SupportsFloat, cast
@@ -160,18 +159,14 @@ class DescribedGoalEnv(Wrapper):
 
     def compute_terminated(self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: object = None) -> Any:
         """Whether an episode ends with this achieved goal; single or batched."""
-        success = self._reached(achieved_goal, desired_goal) & self._terminate_on_success
+        success = _reached(self.description.success_test, self.env, achieved_goal, desired_goal)
+        success = success & self._terminate_on_success
         return success if np.ndim(achieved_goal) > 1 else bool(success)
-
-    def _reached(self, achieved: ArrayLike, desired: ArrayLike) -> NDArray[np.bool_]:
-        one, other = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
-        success = self.description.success_test.function_for(self.env)(np.atleast_2d(one), np.atleast_2d(other))
-        return success if one.ndim > 1 else success[0]
 
     def step(self, action: object) -> tuple[GoalObservation, SupportsFloat, bool, bool, Plain]:
         """Step; adds ``is_success``, shifts the reward, ends the episode with success."""
         observation, reward, terminated, truncated, info = self.env.step(action)
-        success = info["is_success"] = _succeeded(observation, info, self._reached)
+        success = info["is_success"] = _succeeded(self.description.success_test, self.env, observation, info)
         ended = bool(terminated or (self._terminate_on_success and success))
         return observation, float(reward) - self._best, ended, truncated, info
 
@@ -185,20 +180,23 @@ class _EndsWithSuccess(Wrapper):
 
     def step(self, action: object) -> tuple[GoalObservation, SupportsFloat, bool, bool, Plain]:
         observation, reward, terminated, truncated, info = self.env.step(action)
-        success = info["is_success"] = _succeeded(observation, info, self._reached)
+        success = info["is_success"] = _succeeded(self.success_test, self.env, observation, info)
         return observation, reward, bool(terminated or success), truncated, info
 
-    def _reached(self, achieved: ArrayLike, desired: ArrayLike) -> NDArray[np.bool_]:
-        goals = (np.atleast_2d(np.asarray(goal, dtype=np.float64)) for goal in (achieved, desired))
-        return self.success_test.function_for(self.env)(*goals)[0]  # type: ignore[no-any-return]
+
+def _reached(test: SuccessTest, env: Env, achieved: ArrayLike, desired: ArrayLike) -> NDArray[np.bool_]:
+    """Whether goals are reached; single ones ``(goal_dim,)`` or a batch ``(n, goal_dim)``."""
+    one, other = np.asarray(achieved, dtype=np.float64), np.asarray(desired, dtype=np.float64)
+    success = test.function_for(env)(np.atleast_2d(one), np.atleast_2d(other))
+    return success if one.ndim > 1 else success[0]
 
 
-def _succeeded(
-    observation: GoalObservation, info: Plain, reached: Callable[[ArrayLike, ArrayLike], NDArray[np.bool_]]
-) -> bool:
+def _succeeded(test: SuccessTest, env: Env, observation: GoalObservation, info: Plain) -> bool:
     """Success of a step: what ``info`` says, else a test."""
     said = said_success(info)
-    return bool(reached(observation["achieved_goal"], observation["desired_goal"])) if said is None else said
+    if said is not None:
+        return said
+    return bool(_reached(test, env, observation["achieved_goal"], observation["desired_goal"]))
 
 
 def _monitor_in(env: Env) -> Wrapper | None:
