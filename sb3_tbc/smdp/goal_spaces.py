@@ -6,7 +6,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_tbc.aliases import PlainMapping, Space
-from sb3_tbc.arrays import AnyArray
+from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, Indices
 
 GOAL_KEYS = ("observation", "achieved_goal", "desired_goal")
 """The parts of a goal environment's observation."""
@@ -70,6 +70,11 @@ def goal_parts(space: Space) -> Space:
     if not isinstance(space, spaces.Dict) or any(key not in space.spaces for key in GOAL_KEYS):
         return space
     return spaces.Dict({key: space[key] for key in GOAL_KEYS})
+
+
+def rows_of(observation: PlainMapping, where: Indices | BoolArray | int) -> Arrays:
+    """Goal observations of some environments out of those of all, copied; of one, as a view, for a single number."""
+    return {key: observation[key][where] for key in GOAL_KEYS}
 
 
 def width(space: spaces.Dict, key: str) -> int:

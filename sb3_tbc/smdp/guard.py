@@ -15,7 +15,7 @@ from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError
 from sb3_tbc.smdp.episode_limit import BAD_STEP, RESETS, CopyableVecEnvWrapper
 from sb3_tbc.smdp.faults import reset_or_name, step_or_name
 from sb3_tbc.smdp.finite import all_finite, not_finite, place
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, rows_of
 from sb3_tbc.smdp.goal_test import EpisodeJudge
 from sb3_tbc.smdp.spaces import GoalObservation
 
@@ -145,7 +145,7 @@ class Guard:
             return
         for index in map(int, np.flatnonzero(where)):
             info = {BAD_STEP: told[index]} if index in told else {}
-            refuse_reset(index, {key: observation[key][index] for key in GOAL_KEYS}, info)
+            refuse_reset(index, rows_of(observation, index), info)
 
     def _end_bad(
         self, observation: Plain, rewards: Any, dones: Any, infos: list[Plain], seen: Plain, steps: AnyArray
@@ -154,7 +154,7 @@ class Guard:
         bad = self._none_bad.copy()
         for index in range(self.venv.num_envs):
             step, told = int(steps[index]) + 1, infos[index].get(BAD_STEP)
-            elsewhere, row = self._begun_elsewhere(index, infos[index]), {key: seen[key][index] for key in GOAL_KEYS}
+            elsewhere, row = self._begun_elsewhere(index, infos[index]), rows_of(seen, index)
             what = USED_ELSEWHERE if elsewhere else told or not_finite(row, float(rewards[index]))
             if what is None:
                 continue

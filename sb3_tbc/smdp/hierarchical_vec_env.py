@@ -23,7 +23,7 @@ from sb3_tbc.smdp.episode_limit import (
     with_episode_limit,
 )
 from sb3_tbc.smdp.faults import reset_or_name
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, width
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, rows_of, width
 from sb3_tbc.smdp.goal_test import EpisodeJudge
 from sb3_tbc.smdp.guard import Guard, OnBadStep
 from sb3_tbc.smdp.options import Episode, OptionClock, OptionRules, TerminationReason
@@ -254,8 +254,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
 
     def _close_options(self, where: Indices, seen: GoalObservation, dones: BoolArray, infos: list[Plain]) -> FloatArray:
         """Record the options that end; the low level's reward of each."""
-        here = {key: seen[key][where] for key in GOAL_KEYS}
-        reached = self.clock.reached(here, where)
+        reached = self.clock.reached(rows_of(seen, where), where)
         rewards = np.zeros(len(where), dtype=np.float32)
         for row, index in enumerate(where):
             if not self.clock.elapsed[index]:  # its first step was bad
@@ -275,7 +274,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         told = [int(index) for index in over if self._recorder.steps[index]]
         episodes = {index: self._finish_episode(index, infos[index]) for index in told}
         if len(over):
-            self._begin_episodes(over, {key: observation[key][over] for key in GOAL_KEYS})
+            self._begin_episodes(over, rows_of(observation, over))
         self._begin_options(where, observation)
         return episodes
 
@@ -292,7 +291,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
     def _begin_options(self, where: Indices, observation: GoalObservation) -> None:
         if self.high_level is None:
             raise HierarchyError("HierarchicalVecEnv needs a high level that proposes options: set .high_level")
-        seen = {key: observation[key][where] for key in GOAL_KEYS}
+        seen = rows_of(observation, where)
         proposal = self.high_level(self.views.high(seen), where)
         unit = proposal.unit_actions if self.schedule is None else self.schedule(proposal.unit_actions, seen)
         self.clock.begin(where, unit, proposal.testing)

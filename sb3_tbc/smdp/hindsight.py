@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_tbc.arrays import BoolArray, FloatArray
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.options import Episode, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
@@ -73,7 +72,7 @@ def low_level_steps(episode: Episode, reward: LowLevelReward) -> LowLevelSteps:
     per_step = np.repeat(np.arange(len(lengths)), lengths)
     budget = np.array([option.time_budget for option in episode.options])[per_step]
     subgoal = np.stack([option.subgoal for option in episode.options])[per_step]
-    seen = _rows(episode, np.arange(episode.length + 1))
+    seen = episode.seen(slice(None))
     local, points = reward.subgoals.local(seen), reward.subgoals.achieved(seen)
     rewards, over = reward.rewards_and_ends(
         points[:-1], points[1:], subgoal, position + 1 >= budget, may_end=position + 1 >= reward.rules.dt_min
@@ -155,7 +154,7 @@ def relabel_actions(
     if failed.any():
         ends = np.array([option.start + option.duration for option in episode.options])[failed]
         durations = np.array([option.duration for option in episode.options])[failed]
-        reached = subgoals.achieved(_rows(episode, ends))
+        reached = subgoals.achieved(episode.seen(ends))
         took = rules.budget_that_lasted(durations, rng)
         unit = subgoals.scale(reached)
         if tolerance is not None:
@@ -175,10 +174,6 @@ def hindsight_success(reached: FloatArray, subgoal: FloatArray, tolerance: float
     :param tolerance: largest distance of a success, unit coordinates
     """
     return np.asarray(np.linalg.norm(reached - subgoal, axis=-1) <= tolerance)
-
-
-def _rows(episode: Episode, rows: NDArray[np.int64]) -> dict[str, FloatArray]:
-    return {key: getattr(episode, key)[rows] for key in GOAL_KEYS}
 
 
 def failed_tests(episode: Episode) -> BoolArray:
@@ -274,7 +269,7 @@ class _Options:
         self.reached = np.array([option.reached for option in options])
         self.failed_test = failed_tests(episode)
         self.actions, self.changed = actions, changed
-        self.before, self.after = _rows(episode, self.starts), _rows(episode, self.ends)
+        self.before, self.after = episode.seen(self.starts), episode.seen(self.ends)
         self.local, self.here = subgoals.local(self.before), subgoals.achieved(self.before)
         self.dones = np.zeros(len(options), dtype=bool)
         self.dones[-1] = episode.terminated

@@ -9,7 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.arrays import BoolArray, FloatArray, Indices
+from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices, IntArray
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
 
@@ -154,6 +155,10 @@ class Episode(NamedTuple):
     def length(self) -> int:
         """Number of environment steps T."""
         return len(self.rewards)
+
+    def seen(self, steps: IntArray | slice) -> Arrays:
+        """Goal observations before the steps, one row each; step T is the end of the episode."""
+        return {key: getattr(self, key)[steps] for key in GOAL_KEYS}
 
 
 class OptionClock:

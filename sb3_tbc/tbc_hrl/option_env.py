@@ -24,7 +24,7 @@ from sb3_tbc.smdp.episode_limit import (
 )
 from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.finite import not_finite
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, rows_of
 from sb3_tbc.smdp.guard import refuse_reset
 from sb3_tbc.smdp.options import OptionClock
 from sb3_tbc.smdp.spaces import GoalObservation
@@ -93,7 +93,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         self.reset_infos = list(self.venv.reset_infos)
         self._seen = {key: np.array(observation[key]) for key in GOAL_KEYS}
         for index, info in enumerate(self.reset_infos):
-            refuse_reset(index, {key: part[index] for key, part in self._seen.items()}, info)
+            refuse_reset(index, rows_of(self._seen, index), info)
         self._forget(np.arange(self.num_envs))
         return self.policy.views.high(self._seen)
 
@@ -138,7 +138,7 @@ class OptionEnv(CopyableVecEnvWrapper):
 
     def _act(self, live: Indices) -> AnyArray:
         """The low level's actions in the environments whose option is running."""
-        policy, seen = self.policy, {key: self._seen[key][live] for key in GOAL_KEYS}
+        policy, seen = self.policy, rows_of(self._seen, live)
         remaining = policy.rules.remaining(self.clock.time_left[live])
         observation = policy.views.low(seen, self.clock.subgoal[live], remaining)
         unit, after = policy.actor.act(observation, self._membrane[live], self.deterministic, self.rng)
@@ -176,14 +176,15 @@ class OptionEnv(CopyableVecEnvWrapper):
         step = int(self.clock.elapsed[index]) + 1
         if BAD_STEP in info:
             raise EnvironmentFault(f"environment {index}, step {step} of its option: {info[BAD_STEP]}")
-        wrong = not_finite({key: self._seen[key][index] for key in GOAL_KEYS}, reward)
+        wrong = not_finite(rows_of(self._seen, index), reward)
         if wrong is not None:
             raise NonFiniteError(f"environment {index}, step {step} of its option: {wrong}")
 
     def _close(self, index: int, rewards: list[float], over: bool, info: Plain) -> float:
         """Reward of the option that ended; begins a new episode where that is over, too."""
         reward, duration = self.agent.high_reward, np.array([len(rewards)])
-        reached = bool(self.clock.reached({key: self._seen[key][[index]] for key in GOAL_KEYS}, np.array([index]))[0])
+        where = np.array([index])
+        reached = bool(self.clock.reached(rows_of(self._seen, where), where)[0])
         info["option"] = self.clock.close(index, int(duration[0]), reached, over).as_info()
         info["discount"] = float(reward.discounts(duration)[0])
         value = reward.window_rewards(np.array(rewards), np.array([0]), duration)[0]
@@ -195,11 +196,11 @@ class OptionEnv(CopyableVecEnvWrapper):
         return float(value)
 
     def _restart(self, index: int, info: Plain) -> None:
-        last = {key: self._seen[key][[index]] for key in GOAL_KEYS}
-        info["terminal_observation"] = self.policy.views.high(last)[0]
+        where = np.array([index])
+        info["terminal_observation"] = self.policy.views.high(rows_of(self._seen, where))[0]
         observation, told = self.venv.env_method("reset", indices=[index])[0]
         observation, self.reset_infos[index] = checked(observation, told, self._shapes)
         refuse_reset(index, observation, self.reset_infos[index])
         for key in GOAL_KEYS:
             self._seen[key][index] = observation[key]
-        self._forget(np.array([index]))
+        self._forget(where)

@@ -17,7 +17,7 @@ from sb3_tbc.level.actors import NDBCActor
 from sb3_tbc.level.level import SACLevel
 from sb3_tbc.level.policies import LevelPolicy
 from sb3_tbc.ndbc.diagnostics import check_finite
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, rows_of
 from sb3_tbc.smdp.hierarchical_vec_env import Schedule
 from sb3_tbc.smdp.options import OptionClock, OptionRules
 from sb3_tbc.smdp.views import LevelViews
@@ -166,7 +166,7 @@ class TBCPolicy(BasePolicy):
         clock.begin_episode(np.flatnonzero(starts))
         where = np.flatnonzero(over)
         if len(where):
-            seen = {key: batch[key][where] for key in GOAL_KEYS}
+            seen = rows_of(batch, where)
             unit = self.actor.propose(self.views.high(seen), deterministic, self.rng)
             if not np.isfinite(unit).all():
                 raise NonFiniteError(f"high level, subgoal or time budget {unit.tolist()} for observation {seen}")

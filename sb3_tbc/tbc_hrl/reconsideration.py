@@ -6,6 +6,7 @@ import numpy as np
 
 from sb3_tbc.arrays import BoolArray
 from sb3_tbc.level.acting import ActingLevel
+from sb3_tbc.smdp.goal_spaces import rows_of
 from sb3_tbc.smdp.options import OptionClock, OptionRules
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.smdp.views import LevelViews
@@ -37,7 +38,7 @@ class Reconsideration:
         where = np.flatnonzero(clock.may_be_given_up)
         if not len(where):
             return over
-        observations = self.views.high({key: part[where] for key, part in seen.items()})
+        observations = self.views.high(rows_of(seen, where))
         time_left = self.rules.unit_budget(clock.time_left[where])
         rest = np.column_stack([self.views.subgoals.scale(clock.subgoal[where]), time_left])
         no_state = np.zeros((len(where), 0), dtype=np.float32)
