@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -14,18 +13,12 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices, put_under, taken_from
 from sb3_tbc.errors import HierarchyError
-from sb3_tbc.smdp.episode_limit import (
-    BUDGET_EXHAUSTED,
-    CopyableVecEnvWrapper,
-    LastWindow,
-    announce,
-    can_tell,
-    with_episode_limit,
-)
+from sb3_tbc.smdp.episode_limit import BUDGET_EXHAUSTED, CopyableVecEnvWrapper, can_tell, with_episode_limit
 from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, rows_of, width
 from sb3_tbc.smdp.goal_test import EpisodeJudge
 from sb3_tbc.smdp.guard import Guard, OnBadStep
+from sb3_tbc.smdp.last_windows import LastWindows
 from sb3_tbc.smdp.options import Episode, OptionClock, OptionRules, TerminationReason
 from sb3_tbc.smdp.recorder import EpisodeRecorder
 from sb3_tbc.smdp.spaces import GoalObservation
@@ -107,12 +100,10 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         sizes |= {"actions": get_action_dim(venv.action_space), "states": state_dim, "next_states": state_dim}
         self._recorder = EpisodeRecorder(venv.num_envs, sizes)
         ends_early = rules.ends_when_reached or views.subgoals.event is not None
-        self._task_can_tell = ends_early and can_tell(venv)
+        self._last_windows = LastWindows(venv, self.clock, ends_early and can_tell(venv))
         self.judge = EpisodeJudge(venv)
         self.guard = Guard(venv, on_bad_step)
         self._started = False
-        self._last_step: dict[int, int] = {}  # of a window that is its episode's last, by environment
-        self._may_end: set[int] = set()  # environments that know the subgoal of that window
         self._held: dict[int, Arrays] = {}  # what a last window led to of which the task hears a step late
         self._given: AnyArray = np.zeros(0)  # what step_async was given
 
@@ -148,8 +139,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self._recorder.set_state(taken_from("recorder", state))
         for name, array in taken_from("clock", state).items():
             getattr(self.clock, name)[:] = array
-        self._announce(self._everywhere)
-        self._hold(self.clock.ended(observation) & (self.clock.elapsed > 0) & self._last_option, observation)
+        self._last_windows.note(self._everywhere)
+        self._hold(self.clock.ended(observation) & (self.clock.elapsed > 0) & self.clock.is_last, observation)
         self.guard.go_on(observation)
         self._started = True
         return self._low_observation(observation)
@@ -189,7 +180,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
     ) -> HierarchicalStep:
         if not self._started:
             raise HierarchyError("HierarchicalVecEnv.step was called before reset")
-        self._announce_ends()
+        self._last_windows.announce(range(self.num_envs))
         no_memory = self._no_memory
         self._recorder.before_step(
             unit, no_memory if states is None else states, no_memory if next_states is None else next_states
@@ -223,21 +214,16 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         over = self.clock.ended(seen) | dones
         if not np.count_nonzero(over):
             return over
-        late = over & ~dones & self._last_option
+        late = over & ~dones & self.clock.is_last
         if np.count_nonzero(late):
             self._hold(late, seen)
             over &= ~late
         return over
 
-    @property
-    def _last_option(self) -> BoolArray:
-        """Whose running option is the last of its episode, ``(n_envs,)``."""
-        return np.asarray(self.clock.used >= self.rules.max_options)
-
     def _hold(self, late: BoolArray, seen: GoalObservation) -> None:
         """Keep what last windows led to, and have their episodes ended with the next step."""
         for index in map(int, np.flatnonzero(late)):
-            self._last_step[index] = 0
+            self._last_windows.end_next_step(index)
             self._held[index] = {key: np.array(part[index]) for key, part in seen.items()}
 
     def _take_back(self, rewards: FloatArray, infos: list[Plain], seen: GoalObservation) -> BoolArray:
@@ -295,33 +281,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         proposal = self.high_level(self.views.high(seen), where)
         unit = proposal.unit_actions if self.schedule is None else self.schedule(proposal.unit_actions, seen)
         self.clock.begin(where, unit, proposal.testing)
-        self._announce(where)
-
-    def _announce(self, where: Indices) -> None:
-        """Take note of the windows that are the last of their episodes."""
-        for index in map(int, where):
-            self._last_step.pop(index, None)
-            self._may_end.discard(index)
-            if self.clock.used[index] >= self.rules.max_options:
-                self._last_step[index] = max(1, math.ceil(self.clock.time_budget[index]))
-                if self._task_can_tell and self.views.subgoals.event is not None:
-                    announce(self.venv, index, LastWindow(False, self.views.subgoals))
-
-    def _announce_ends(self) -> None:
-        """Tell the environments whose last window is, or may be, over with the next step, to end the episode then."""
-        for index, last in self._last_step.items():
-            step = self.clock.elapsed[index] + 1
-            if step >= last:
-                announce(self.venv, index, LastWindow(True))
-            elif step >= self.rules.dt_min and index not in self._may_end and self._ends_early:
-                self._may_end.add(index)
-                subgoal = self.clock.subgoal[index].copy()
-                announce(self.venv, index, LastWindow(False, self.views.subgoals, subgoal))
-
-    @property
-    def _ends_early(self) -> bool:
-        """Whether the environment is to end an episode where its last window reaches the subgoal."""
-        return self._task_can_tell and self.rules.ends_when_reached
+        self._last_windows.note(where)
 
     def _low_observation(self, observation: GoalObservation) -> FloatArray:
         remaining = self.rules.remaining(self.clock.time_left)

@@ -220,6 +220,11 @@ class OptionClock:
         return np.asarray(self.elapsed >= self.time_budget)
 
     @property
+    def is_last(self) -> BoolArray:
+        """Whose option uses up the decisions of its episode, ``(n_envs,)``."""
+        return np.asarray(self.used >= self.rules.max_options)
+
+    @property
     def may_end(self) -> BoolArray:
         """Whose window is old enough to end by reaching its subgoal, ``(n_envs,)``."""
         return np.asarray(self.elapsed >= self.rules.dt_min)
@@ -227,7 +232,7 @@ class OptionClock:
     @property
     def may_be_given_up(self) -> BoolArray:
         """Which windows the high level may end now, ``(n_envs,)``: no test, and not the episode's last."""
-        return np.asarray(self.may_end & ~self.testing & ~self.expired & (self.used < self.rules.max_options))
+        return np.asarray(self.may_end & ~self.testing & ~self.expired & ~self.is_last)
 
     def give_up(self, which: BoolArray) -> None:
         """Let the windows of a mask ``(n_envs,)`` end with the last step."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import cast
 
 import numpy as np
@@ -16,8 +15,6 @@ from sb3_tbc.errors import EnvironmentFault, NonFiniteError
 from sb3_tbc.smdp.episode_limit import (
     BAD_STEP,
     CopyableVecEnvWrapper,
-    LastWindow,
-    announce,
     checked,
     shapes_of,
     with_episode_limit,
@@ -26,6 +23,7 @@ from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.finite import not_finite
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, rows_of
 from sb3_tbc.smdp.guard import refuse_reset
+from sb3_tbc.smdp.last_windows import LastWindows
 from sb3_tbc.smdp.options import OptionClock
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.tbc_hrl.foreign_high import refuse_reconsidering
@@ -77,6 +75,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         self.agent, self.policy, self.deterministic = agent, policy, deterministic
         self.rng = np.random.default_rng(seed)
         self.clock = OptionClock(venv.num_envs, policy.views.subgoals, policy.rules)
+        self._last_windows = LastWindows(self.venv, self.clock, task_can_tell=True)
         self._membrane = policy.actor.blank(venv.num_envs)
         self._shapes = shapes_of(venv.observation_space)  # env_method brings what worker processes have not checked
         self._seen: dict[str, FloatArray] = {}
@@ -109,6 +108,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         infos: list[Plain] = [{} for _ in range(self.num_envs)]
         live = np.arange(self.num_envs)
         while len(live):
+            self._last_windows.announce(live)
             for index, action in zip(live, self._act(live), strict=True):
                 reward, dones[index], infos[index] = self._step_one(int(index), action)
                 rewards[index].append(reward)
@@ -127,14 +127,11 @@ class OptionEnv(CopyableVecEnvWrapper):
         self._membrane[where] = 0.0
 
     def _begin(self) -> None:
-        """Start the options that were asked for; an event ends the last of an episode."""
+        """Start the options that were asked for."""
         schedule, everywhere = self.policy.schedule, np.arange(self.num_envs)
         unit = self._actions if schedule is None else schedule(self._actions, self._seen)
         self.clock.begin(everywhere, unit)
-        subgoals = self.policy.views.subgoals
-        if subgoals.event is not None:
-            for index in np.flatnonzero(self.clock.used >= self.policy.rules.max_options):
-                announce(self.venv, int(index), LastWindow(False, subgoals))
+        self._last_windows.note(everywhere)
 
     def _act(self, live: Indices) -> AnyArray:
         """The low level's actions in the environments whose option is running."""
@@ -148,8 +145,6 @@ class OptionEnv(CopyableVecEnvWrapper):
 
     def _step_one(self, index: int, action: AnyArray) -> tuple[float, bool, Plain]:
         """One step of one environment: its reward, whether its episode is over, its info."""
-        if self.clock.used[index] >= self.policy.rules.max_options:
-            self._announce_end(index)
         observation, reward, terminated, truncated, info = self.venv.env_method("step", action, indices=[index])[0]
         observation, info = checked(observation, info, self._shapes)
         for key in GOAL_KEYS:
@@ -157,15 +152,6 @@ class OptionEnv(CopyableVecEnvWrapper):
         self._refuse_bad(index, float(reward), info)
         over = bool(terminated or truncated)
         return float(reward), over, {**info, "TimeLimit.truncated": over and not terminated}
-
-    def _announce_end(self, index: int) -> None:
-        """Tell an environment that its episode ends with this step, or if this step reaches the subgoal."""
-        step, rules = self.clock.elapsed[index] + 1, self.policy.rules
-        if step >= self.clock.time_budget[index]:
-            announce(self.venv, index, LastWindow(True))
-        elif rules.ends_when_reached and step == max(1, math.ceil(rules.dt_min)):
-            subgoal = self.clock.subgoal[index].copy()
-            announce(self.venv, index, LastWindow(False, self.policy.views.subgoals, subgoal))
 
     def _refuse_bad(self, index: int, reward: float, info: Plain) -> None:
         """Let nothing through that is not finite, or of another shape.
@@ -189,8 +175,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         info["discount"] = float(reward.discounts(duration)[0])
         value = reward.window_rewards(np.array(rewards), np.array([0]), duration)[0]
         value -= reward.price(self.clock.time_budget[index])
-        used_up = self.clock.used[index] >= self.policy.rules.max_options
-        if over or used_up:
+        if over or self.clock.is_last[index]:
             info["TimeLimit.truncated"] = bool(info["TimeLimit.truncated"] or not over)
             self._restart(index, info)
         return float(value)
