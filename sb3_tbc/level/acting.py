@@ -221,6 +221,10 @@ class FrozenActor:
         return self._version == self._policy.weights_version and self._weights.changed()
 
 
+_UNUSED = np.random.default_rng(0)
+"""Stands where acting by the mean, which draws nothing, is to be given a generator."""
+
+
 class ActingLevel:
     """A level's policy at work: all that acting needs of a level, without what it learns from.
 
@@ -263,6 +267,12 @@ class ActingLevel:
         :return: unit actions ``(n, action_dim)`` and next states ``(n, state_dim)``
         """
         return self._frozen[average].act(observations, states, deterministic, rng)
+
+    def means(self, observations: FloatArray, average: bool = False) -> FloatArray:
+        """Unit actions ``(n, action_dim)`` without noise, of an actor without memory; parameters as of :meth:`act`."""
+        no_memory = np.zeros((len(observations), 0), dtype=np.float32)
+        unit, _ = self.act(observations, no_memory, True, _UNUSED, average)
+        return unit
 
     def values(self, observations: FloatArray, unit_actions: FloatArray) -> FloatArray:
         """The lowest of the critics' values of actions, ``(n,)``.

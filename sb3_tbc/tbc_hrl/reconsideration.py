@@ -27,7 +27,6 @@ class Reconsideration:
 
     def __init__(self, high: ActingLevel, views: LevelViews, rules: OptionRules, margin: float) -> None:
         self.high, self.views, self.rules, self.margin = high, views, rules, margin
-        self._rng = np.random.default_rng(0)  # the mean needs no noise
 
     def __call__(self, seen: GoalObservation, clock: OptionClock) -> BoolArray:
         """Which windows end now, ``(n_envs,)``.
@@ -41,8 +40,7 @@ class Reconsideration:
         observations = self.views.high(rows_of(seen, where))
         time_left = self.rules.unit_budget(clock.time_left[where])
         rest = np.column_stack([self.views.subgoals.scale(clock.subgoal[where]), time_left])
-        no_state = np.zeros((len(where), 0), dtype=np.float32)
-        new, _ = self.high.act(observations, no_state, True, self._rng, average=True)
+        new = self.high.means(observations, average=True)
         values = self.high.values(np.concatenate([observations, observations]), np.concatenate([new, rest]))
         over[where] = values[: len(where)] > values[len(where) :] + self.margin
         return over

@@ -73,11 +73,8 @@ class DurationTeacher:
 
     def __init__(self, rule: ReachRule, high: ActingLevel) -> None:
         self.rule, self.high = rule, high
-        self._unused = np.random.default_rng(0)  # acting by the mean draws nothing
 
     def __call__(self, observations: Float32, local: Float32, here: Float32) -> Float32:
         """Unit time budgets ``(n,)`` of high-level observations and of the states they were made of."""
-        no_state = np.zeros((len(observations), 0), dtype=np.float32)
-        unit, _ = self.high.act(observations, no_state, True, self._unused)
-        subgoal = self.rule.views.subgoals.unscale(unit[:, :-1])
+        subgoal = self.rule.views.subgoals.unscale(self.high.means(observations)[:, :-1])
         return self.rule.rules.unit_budget(self.rule.steps(local, here, subgoal)).astype(np.float32)
