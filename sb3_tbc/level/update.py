@@ -332,7 +332,8 @@ class SACUpdate:
             leaf = x.state.critic.detach().requires_grad_()
             if self.statistics is None:
                 target_q, clipped = self._target_q(x, self._next_q(x, actions), log_prob, ent_coef)
-                q = self.policy.critic.q_blocks(self.critic.unflatten(leaf), self._seen(batch), batch.actions)
+                blocks, seen = self.critic.unflatten(leaf), self._critics_see(batch.observations, batch.states)
+                q = self.policy.critic.q_blocks(blocks, seen, batch.actions)
             else:
                 q, next_q = self._joint_q(x, leaf, actions)
                 target_q, clipped = self._target_q(x, next_q, log_prob, ent_coef)
@@ -340,23 +341,17 @@ class SACUpdate:
             (grad,) = th.autograd.grad(loss, leaf)
         return grad, (loss, q.mean(), clipped, target_q.amin(), target_q.amax())
 
-    def _seen(self, batch: LevelBatch) -> th.Tensor:
-        """What critics see of the steps: the observations, and the actor's memory if they are to see it."""
-        if self.policy.level_kwargs["critic_memory"]:
-            return th.cat((batch.observations, batch.states), dim=-1)
-        return batch.observations
-
-    def _seen_next(self, batch: LevelBatch) -> th.Tensor:
-        """What critics see of the steps that follow."""
-        if self.policy.level_kwargs["critic_memory"]:
-            return th.cat((batch.next_observations, batch.next_states), dim=-1)
-        return batch.next_observations
+    def _critics_see(self, observations: th.Tensor, memory: th.Tensor) -> th.Tensor:
+        """The critics' inputs: the observations, and the actor's memory if they are to see it."""
+        return th.cat((observations, memory), dim=-1) if self.policy.level_kwargs["critic_memory"] else observations
 
     def _next_q(self, x: StepInputs, next_actions: th.Tensor) -> th.Tensor:
         """The target networks' values of the next actions, ``(n_critics, batch, 1)``."""
+        batch = x.given.batch
         with th.no_grad():
             blocks = self.target.unflatten(x.state.target)
-            return self.policy.critic.q_blocks(blocks, self._seen_next(x.given.batch), next_actions)
+            seen = self._critics_see(batch.next_observations, batch.next_states)
+            return self.policy.critic.q_blocks(blocks, seen, next_actions)
 
     def _joint_q(self, x: StepInputs, leaf: th.Tensor, next_actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Values ``(n_critics, batch, 1)`` of the stored actions and, without gradient, of the next ones, without
@@ -366,10 +361,12 @@ class SACUpdate:
         # otherwise than stored ones, and normalised by statistics of the latter alone their values are off. With joint
         # statistics no target networks are needed (section 3 of arXiv 1902.05605).
         batch = x.given.batch
-        observations = th.cat((self._seen(batch), self._seen_next(batch)))
+        now = self._critics_see(batch.observations, batch.states)
+        later = self._critics_see(batch.next_observations, batch.next_states)
+        seen = th.cat((now, later))
         actions = th.cat((batch.actions, next_actions))
-        joint, seen = self.policy.critic.q_blocks_of_batch(self.critic.unflatten(leaf), observations, actions)
-        x.state.statistics[0].lerp_(th.cat([part.flatten() for part in seen]), BATCH_MOMENTUM)
+        joint, statistics = self.policy.critic.q_blocks_of_batch(self.critic.unflatten(leaf), seen, actions)
+        x.state.statistics[0].lerp_(th.cat([part.flatten() for part in statistics]), BATCH_MOMENTUM)
         q, next_q = joint.chunk(2, dim=1)
         return q, next_q.detach()
 
@@ -403,13 +400,11 @@ class SACUpdate:
 
         The latter is the paper's ``L_dt = E (dt - dt*)^2``, in unit coordinates of the action.
         """
+        batch = x.given.batch
         with th.enable_grad():
-            q = self.policy.critic.q_blocks(
-                self.critic.unflatten(x.state.critic),
-                self._seen(x.given.batch),
-                actions,
-                [] if self.statistics is None else self.statistics.unflatten(x.state.statistics[0]),
-            )
+            blocks, seen = self.critic.unflatten(x.state.critic), self._critics_see(batch.observations, batch.states)
+            statistics = [] if self.statistics is None else self.statistics.unflatten(x.state.statistics[0])
+            q = self.policy.critic.q_blocks(blocks, seen, actions, statistics)
             loss = (ent_coef * log_prob - self._ascended(q)).mean()
             for labels in x.given.labels:
                 loss = loss + self.label_coef * (actions[:, -1:] - labels).square().mean()
