@@ -7,24 +7,24 @@ environment truncates the step that ends it.
 
 from __future__ import annotations
 
-import inspect
 import time
-from typing import Any, NamedTuple, SupportsFloat, cast
+from typing import Any, NamedTuple, SupportsFloat
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
-from numpy.typing import ArrayLike
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_tbc.aliases import Env, Plain, Space, Wrapper
+from sb3_tbc.aliases import Env, Plain, Wrapper
 from sb3_tbc.arrays import Arrays, BoolArray, FloatArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
+from sb3_tbc.smdp.copyable import CopyableVecEnvWrapper
 from sb3_tbc.smdp.faults import fault
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, goal_space_problems
+from sb3_tbc.smdp.shapes import BAD_STEP, receive_checked, reset_checked, shapes_of, wrong_shape
 from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
 ANNOUNCE = "announce_last_window"
@@ -32,9 +32,6 @@ ANNOUNCE = "announce_last_window"
 
 BUDGET_EXHAUSTED = "budget_exhausted"
 """Key of ``info``: the episode ended with this step because the high level's decisions are used up."""
-
-BAD_STEP = "bad_step"
-"""Key of ``info``: what is wrong with what this step, or this reset, gave; the observation is not to be used then."""
 
 RESETS = "sb3_tbc.resets"
 """Key of ``info``: how often the task was reset so far, which tells whether someone else has begun an episode in it."""
@@ -158,53 +155,6 @@ def _is_number(value: object) -> bool:
     )
 
 
-Shapes = list[tuple[str, tuple[int, ...] | None]]
-"""Names of the parts of an observation with their shapes."""
-
-
-def shapes_of(space: Space) -> Shapes:
-    """The parts of a goal environment's observation with their shapes; none of another space."""
-    return [(key, part.shape) for key, part in space.spaces.items()] if isinstance(space, spaces.Dict) else []
-
-
-def wrong_shape(observation: object, shapes: Shapes) -> str | None:
-    """What of an observation has another shape than its space says; None if nothing has.
-
-    :param shapes: names of its parts with their shapes
-    """
-    if isinstance(observation, dict):  # the usual case, without the cost of a generator
-        for key, shape in shapes:
-            if getattr(observation.get(key), "shape", None) != shape:
-                break
-        else:
-            return None
-    for key, shape in shapes:
-        part = observation.get(key) if isinstance(observation, dict) else None
-        if part is None or _shape(part) != shape:
-            got = "nothing" if part is None else f"shape {_shape(part)}"
-            return f"observation[{key!r}] must have shape {shape} as its space says, got {got}"
-    return None
-
-
-def _shape(part: ArrayLike) -> tuple[int, ...] | None:
-    """Shape of an array or nested list; None for one that has none."""
-    try:
-        return np.shape(part)
-    except ValueError:
-        return None
-
-
-class CopyableVecEnvWrapper(VecEnvWrapper):
-    """A wrapper that can be copied and pickled. SB3's cannot: it keeps a table of all attributes of its class."""
-
-    def __getstate__(self) -> Plain:
-        """The state without that table."""
-        return {name: value for name, value in self.__dict__.items() if name != "class_attributes"}
-
-    def __setstate__(self, state: Plain) -> None:
-        self.__dict__.update(state, class_attributes=dict(inspect.getmembers(type(self))))
-
-
 class LimitingVecEnv(CopyableVecEnvWrapper):
     """As :class:`EpisodeLimit`, for environments that cannot be wrapped one by one, e.g. those in other processes.
 
@@ -290,52 +240,6 @@ class LimitingVecEnv(CopyableVecEnvWrapper):
         for key, part in observation.items():
             part[index] = fresh[key]
         dones[index] = True
-
-
-def reset_checked(workers: SubprocVecEnv, shapes: Shapes) -> VecEnvObs:
-    """``SubprocVecEnv.reset``, but an observation of a wrong shape is told of in its ``reset_infos``."""
-    for remote, seed, options in zip(workers.remotes, workers._seeds, workers._options, strict=True):
-        remote.send(("reset", (seed, options)))
-    results = [remote.recv() for remote in workers.remotes]
-    told = [checked(observation, info, shapes) for observation, info in results]
-    workers.reset_infos = [info for _, info in told]
-    workers._reset_seeds()
-    workers._reset_options()
-    return _stacked([observation for observation, _ in told], workers)
-
-
-def receive_checked(workers: SubprocVecEnv, shapes: Shapes) -> VecEnvStepReturn:
-    """``SubprocVecEnv.step_wait``, but an observation of a wrong shape is told of in ``info``."""
-    results = [remote.recv() for remote in workers.remotes]
-    workers.waiting = False
-    observations, rewards, dones, infos, reset_infos = (list(column) for column in zip(*results, strict=True))
-    for index, done in enumerate(dones):
-        if not done:
-            observations[index], infos[index] = checked(observations[index], infos[index], shapes)
-            continue
-        last, infos[index] = checked(infos[index]["terminal_observation"], infos[index], shapes)
-        infos[index]["terminal_observation"] = last
-        observations[index], reset_infos[index] = checked(observations[index], reset_infos[index], shapes)
-    workers.reset_infos = reset_infos
-    return _stacked(observations, workers), np.stack(rewards), np.stack(dones), infos
-
-
-def checked(observation: VecEnvObs, info: Plain, shapes: Shapes) -> tuple[Arrays, Plain]:
-    """What an environment shows, or zeros and an ``info`` that says which shape is wrong.
-
-    :param shapes: names of its parts with their shapes
-    """
-    wrong = wrong_shape(observation, shapes)
-    if wrong is None:
-        return cast(Arrays, observation), info
-    return {key: np.zeros(shape or ()) for key, shape in shapes}, {BAD_STEP: wrong}
-
-
-def _stacked(observations: list[Plain], workers: SubprocVecEnv) -> VecEnvObs:
-    space = workers.observation_space
-    if not isinstance(space, spaces.Dict):
-        return np.stack(observations)  # type: ignore[arg-type]
-    return {key: np.stack([seen[key] for seen in observations]) for key in space.spaces}
 
 
 class PutLimit:

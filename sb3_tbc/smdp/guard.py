@@ -12,11 +12,13 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
 from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError
-from sb3_tbc.smdp.episode_limit import BAD_STEP, RESETS, CopyableVecEnvWrapper
+from sb3_tbc.smdp.copyable import CopyableVecEnvWrapper
+from sb3_tbc.smdp.episode_limit import RESETS
 from sb3_tbc.smdp.faults import reset_or_name, step_or_name
 from sb3_tbc.smdp.finite import all_finite, not_finite, place
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, rows_of
 from sb3_tbc.smdp.goal_test import EpisodeJudge
+from sb3_tbc.smdp.shapes import BAD_STEP
 from sb3_tbc.smdp.spaces import GoalObservation
 
 OnBadStep = Literal["stop", "end-episode"]
@@ -169,18 +171,22 @@ class Guard:
             for key, part in last.items():
                 seen[key][index] = part
             if not dones[index]:
-                fresh, info = self.venv.env_method("reset", indices=[index])[0]
-                refuse_reset(index, fresh, info)
-                if RESETS in info:
-                    told_at_reset = list(self.venv.unwrapped.reset_infos)
-                    told_at_reset[index] = info
-                    self.venv.unwrapped.reset_infos = told_at_reset
-                for key, part in observation.items():
-                    part[index] = fresh[key]
+                self._begin_one(index, observation)
                 dones[index] = True
             infos[index] = {"terminal_observation": last, "TimeLimit.truncated": True, "is_success": False,
                             BAD_STEP: what}  # fmt: skip
         return bad
+
+    def _begin_one(self, index: int, observation: Plain) -> None:
+        """Reset one environment alone, and put what it shows into the observations of all."""
+        fresh, info = self.venv.env_method("reset", indices=[index])[0]
+        refuse_reset(index, fresh, info)
+        if RESETS in info:
+            told = list(self.venv.unwrapped.reset_infos)
+            told[index] = info
+            self.venv.unwrapped.reset_infos = told
+        for key, part in observation.items():
+            part[index] = fresh[key]
 
     def _stop_or_count(self, index: int, step: int, what: str, kind: type[Exception]) -> None:
         self._in_a_row[index] = self._in_a_row[index] + 1 if step == 1 else 0

@@ -13,7 +13,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices, put_under, taken_from
 from sb3_tbc.errors import HierarchyError
-from sb3_tbc.smdp.episode_limit import BUDGET_EXHAUSTED, CopyableVecEnvWrapper, can_tell, with_episode_limit
+from sb3_tbc.smdp.copyable import CopyableVecEnvWrapper
+from sb3_tbc.smdp.episode_limit import BUDGET_EXHAUSTED, can_tell, with_episode_limit
 from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, UnitActions, check_goal_space, rows_of, width
 from sb3_tbc.smdp.goal_test import EpisodeJudge

@@ -12,9 +12,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, Arrays
-from sb3_tbc.smdp.episode_limit import BAD_STEP
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.goal_test import RewardComparison, goal_test_of
+from sb3_tbc.smdp.shapes import BAD_STEP
 from sb3_tbc.tbc_hrl.environment import attribute_of
 
 ARRAYS = ("actions", "rewards", "dones", "timeouts", "ep_start", "ep_length")

@@ -12,19 +12,15 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, FloatArray, Indices
 from sb3_tbc.errors import EnvironmentFault, NonFiniteError
-from sb3_tbc.smdp.episode_limit import (
-    BAD_STEP,
-    CopyableVecEnvWrapper,
-    checked,
-    shapes_of,
-    with_episode_limit,
-)
+from sb3_tbc.smdp.copyable import CopyableVecEnvWrapper
+from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.finite import not_finite
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, rows_of
 from sb3_tbc.smdp.guard import refuse_reset
 from sb3_tbc.smdp.last_windows import LastWindows
 from sb3_tbc.smdp.options import OptionClock
+from sb3_tbc.smdp.shapes import BAD_STEP, checked, shapes_of
 from sb3_tbc.smdp.spaces import GoalObservation
 from sb3_tbc.tbc_hrl.foreign_high import refuse_reconsidering
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL

@@ -124,11 +124,11 @@ class TBCPolicy(BasePolicy):
         if episode_start is not None:
             starts |= episode_starts(episode_start, n)
         over = self._begin_options(clock, batch, starts, deterministic)
-        seen = self.views.low(batch, clock.subgoal, self.rules.remaining(clock.time_left))
+        low_observation = self.views.low(batch, clock.subgoal, self.rules.remaining(clock.time_left))
         membrane = self.actor.forget(membrane, over, starts)
-        unit, membrane = self.actor.act(seen, membrane, deterministic, self.rng)
+        unit, membrane = self.actor.act(low_observation, membrane, deterministic, self.rng)
         if not np.isfinite(unit).all():
-            self._name_non_finite(seen, membrane, unit, clock.elapsed)
+            self._name_non_finite(low_observation, membrane, unit, clock.elapsed)
         actions = self.unit.unscale(unit)
         clock.tick()
         return (actions[0] if single else actions), cast("tuple[AnyArray, ...]", _packed(clock, membrane))
@@ -174,14 +174,14 @@ class TBCPolicy(BasePolicy):
         return over
 
     def _name_non_finite(
-        self, seen: FloatArray, membrane: FloatArray, unit: FloatArray, elapsed: NDArray[np.int64]
+        self, inputs: FloatArray, membrane: FloatArray, unit: FloatArray, elapsed: NDArray[np.int64]
     ) -> None:
         """Raise, naming where the low level stopped being finite; steps count from the beginning of the option."""
         row = int(np.flatnonzero(~np.isfinite(unit).all(axis=1))[0])
         actor, step, one = self.low_policy.actor, int(elapsed[row]), slice(row, row + 1)
         if isinstance(actor, NDBCActor):
-            check_finite(actor.net.wiring, seen[one], membrane[one], unit[one], "low", step)
-        raise NonFiniteError(f"low level, step {step}: action {unit[row].tolist()} for inputs {seen[row].tolist()}")
+            check_finite(actor.net.wiring, inputs[one], membrane[one], unit[one], "low", step)
+        raise NonFiniteError(f"low level, step {step}: action {unit[row].tolist()} for inputs {inputs[row].tolist()}")
 
     def _as_batch(self, observation: object) -> tuple[Arrays, bool]:
         if isinstance(observation, tuple):
