@@ -8,12 +8,10 @@ remembers. A new setting is one field here and the code that uses it. Settings o
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Literal, Self
 
 from sb3_tbc.settings import Range, SettingError, Settings
-from sb3_tbc.tbc_hrl.idle_settings import idle_in_actor, idle_in_agent
 from sb3_tbc.tbc_hrl.level_config import (
     CircuitConfig,
     Fraction,
@@ -229,23 +227,6 @@ class TBCConfig(AgentConfig):
         With ``target: smdp`` a decision has its price; with ``target: decision`` the reward of a success is 0 already.
         """
         return self.completion_bonus > (self.decision_cost if self.target == "smdp" else 0.0)
-
-    def warn_before_learning(self) -> None:
-        """Name idle settings, and replay buffers that hold less than a batch: their level would never be updated."""
-        tests = self.testing_penalty is not None, self.deterministic_testing
-        idle = [
-            *idle_in_agent(self.window_end, self.reconsider_margin, self.testing_fraction, *tests),
-            *idle_in_actor(self.low.policy_kwargs, self.memory),
-        ]
-        for sentence in idle:
-            warnings.warn(sentence, stacklevel=3)
-        for name, level in (("high", self.high), ("low", self.low)):
-            if level.buffer_size < level.batch_size:
-                warnings.warn(
-                    f"the {name} level is never updated: {name}.buffer_size={level.buffer_size} holds less than a "
-                    f"batch of {name}.batch_size={level.batch_size}",
-                    stacklevel=3,
-                )
 
     @property
     def failed_test_reward(self) -> float:

@@ -26,7 +26,7 @@ from sb3_tbc.smdp.goal_test import check_goal_test
 from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.tasks.layouts import layout_cure
 from sb3_tbc.tasks.time_limit import declared_limit, time_limit
-from sb3_tbc.tbc_hrl.calls import refuse_vec_normalize
+from sb3_tbc.tbc_hrl.checks import refuse_vec_normalize
 
 
 def attribute_of(env: VecEnv, name: str) -> Any:

@@ -15,7 +15,7 @@ from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_spaces import goal_parts
 from sb3_tbc.smdp.guard import GuardedVecEnv
 from sb3_tbc.smdp.options import Episode
-from sb3_tbc.tbc_hrl.calls import refuse_vec_normalize
+from sb3_tbc.tbc_hrl.checks import refuse_vec_normalize
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL

@@ -30,7 +30,7 @@ from sb3_tbc.smdp.hindsight import check_goal_strategy
 from sb3_tbc.tbc_hrl import resume
 from sb3_tbc.tbc_hrl.arguments import FlatArguments, SB3Arguments, SignatureOfSettings, takes
 from sb3_tbc.tbc_hrl.averaged_policy import AveragedPolicy
-from sb3_tbc.tbc_hrl.calls import refuse_policy, refuse_vec_normalize, whole_steps, without_sb3_names
+from sb3_tbc.tbc_hrl.checks import refuse_policy, refuse_vec_normalize, whole_steps, without_sb3_names
 from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.diagnostics import record_settings
 from sb3_tbc.tbc_hrl.environment import attribute_of, in_fitting_vector, in_vector

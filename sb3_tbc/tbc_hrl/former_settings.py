@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.settings import Settings, hints, merge, section_of
-from sb3_tbc.tbc_hrl.calls import refuse_level_names
+from sb3_tbc.tbc_hrl.checks import refuse_level_names
 
 FORMER_NAMES = {"high_settings": "high", "low_settings": "low"}
 """Attributes of version 0.1.0 and the sections that they have become."""

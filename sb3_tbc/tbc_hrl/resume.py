@@ -27,7 +27,7 @@ NOT_KNOWN = "the environments begin new episodes: those that ran when the run wa
 ELSEWHERE = "the environments begin new episodes: replaying the saved ones led to other observations"
 
 
-class LearningState(NamedTuple):
+class MovingParts(NamedTuple):
     """What changes while an agent learns, besides its settings."""
 
     num_timesteps: int
@@ -41,78 +41,78 @@ class LearningState(NamedTuple):
     collector: Collector | None
 
 
-def generators(learning: LearningState) -> dict[str, np.random.Generator]:
+def generators(parts: MovingParts) -> dict[str, np.random.Generator]:
     """Every source of randomness that learning draws from."""
     found = {
-        "agent": learning.rng,
-        "policy": learning.policy_rng,
-        "high.noise": learning.high.noise_rng,
-        "low.noise": learning.low.noise_rng,
-        "high.replay": learning.replay.high.rng,
-        "low.replay": learning.replay.low.rng,
+        "agent": parts.rng,
+        "policy": parts.policy_rng,
+        "high.noise": parts.high.noise_rng,
+        "low.noise": parts.low.noise_rng,
+        "high.replay": parts.replay.high.rng,
+        "low.replay": parts.replay.low.rng,
     }
-    if learning.reachability is not None:
-        found["reachability"] = learning.reachability.rng
+    if parts.reachability is not None:
+        found["reachability"] = parts.reachability.rng
     return found
 
 
-def reseed(learning: LearningState, seed: int) -> None:
+def reseed(parts: MovingParts, seed: int) -> None:
     """Let every source of randomness begin anew."""
-    found = generators(learning)
-    for generator, part in zip(found.values(), np.random.SeedSequence(seed).spawn(len(found)), strict=True):
-        generator.bit_generator.state = np.random.default_rng(part).bit_generator.state
+    found = generators(parts)
+    for generator, child in zip(found.values(), np.random.SeedSequence(seed).spawn(len(found)), strict=True):
+        generator.bit_generator.state = np.random.default_rng(child).bit_generator.state
 
 
-def get_state(learning: LearningState) -> Arrays:
+def get_state(parts: MovingParts) -> Arrays:
     """Random streams, counters, live options and running episodes, as plain arrays.
 
-    :param learning: what to take them from
+    :param parts: what to take them from
     """
     plain = {
-        "timesteps": int(learning.num_timesteps),
-        "generators": {name: rng.bit_generator.state for name, rng in generators(learning).items()},
-        "n_updates": [learning.high._n_updates, learning.low._n_updates],
-        "diagnostics": dict(learning.diagnostics.values),
+        "timesteps": int(parts.num_timesteps),
+        "generators": {name: rng.bit_generator.state for name, rng in generators(parts).items()},
+        "n_updates": [parts.high._n_updates, parts.low._n_updates],
+        "diagnostics": dict(parts.diagnostics.values),
     }
     arrays: Arrays = {}
-    actor = learning.low.policy.actor
+    actor = parts.low.policy.actor
     if isinstance(actor, NDBCActor):
         plain["circuit"] = {"updates": actor.net.updates, "sub_steps": actor.net.sub_steps}
         arrays["direction"] = actor.net.lipschitz.direction.numpy().copy()
-    if learning.collector is not None and isinstance(learning.collector.env.venv, GoalVecEnv):
-        plain["episodes"], actions = _running(learning.collector.env.venv)
+    if parts.collector is not None and isinstance(parts.collector.env.venv, GoalVecEnv):
+        plain["episodes"], actions = _running(parts.collector.env.venv)
         arrays |= actions
-        arrays |= put_under("collector", learning.collector.get_state())
+        arrays |= put_under("collector", parts.collector.get_state())
     return {**arrays, "plain": np.array(json.dumps(plain))}
 
 
-def set_state(learning: LearningState, state: Mapping[str, AnyArray]) -> bool:
+def set_state(parts: MovingParts, state: Mapping[str, AnyArray]) -> bool:
     """Restore what :func:`get_state` gave; False, with nothing changed, if the agent was saved at another moment.
 
     Then the log says that the run continues, but not exactly as the saved one would have. If the environments cannot be
     brought back to their state, everything else is restored and they begin new episodes; the log says that, too.
     """
     plain = _plain(state)
-    if plain.get("timesteps") != learning.num_timesteps:
+    if plain.get("timesteps") != parts.num_timesteps:
         saved = plain.get("timesteps", "an unknown number of")
         logger.warning(
-            f"the replay buffer was saved after {saved} steps, the agent after {learning.num_timesteps}: learning goes "
+            f"the replay buffer was saved after {saved} steps, the agent after {parts.num_timesteps}: learning goes "
             "on with that buffer, but with new episodes and other random numbers than the saved run"
         )
         return False
-    if learning.collector is not None:
-        _relive(learning.collector, plain, state)
-    for name, rng in generators(learning).items():
+    if parts.collector is not None:
+        _relive(parts.collector, plain, state)
+    for name, rng in generators(parts).items():
         if name in plain["generators"]:
             rng.bit_generator.state = plain["generators"][name]
-    learning.high._n_updates, learning.low._n_updates = plain["n_updates"]
-    learning.diagnostics.values.clear()
-    learning.diagnostics.values.update(plain["diagnostics"])
-    actor = learning.low.policy.actor
+    parts.high._n_updates, parts.low._n_updates = plain["n_updates"]
+    parts.diagnostics.values.clear()
+    parts.diagnostics.values.update(plain["diagnostics"])
+    actor = parts.low.policy.actor
     if isinstance(actor, NDBCActor) and "circuit" in plain:
         actor.net.updates, actor.net.sub_steps = plain["circuit"]["updates"], plain["circuit"]["sub_steps"]
         actor.net.lipschitz.direction.copy_(actor.net.lipschitz.direction.new_tensor(state["direction"]))
-        learning.low.acting.refresh()
+        parts.low.acting.refresh()
     return True
 
 

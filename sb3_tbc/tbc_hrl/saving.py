@@ -21,7 +21,7 @@ from sb3_tbc.settings import SettingError, Settings, hints, plain
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import named_reset
 from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
-from sb3_tbc.tbc_hrl.calls import device_here, without_sb3_names
+from sb3_tbc.tbc_hrl.checks import device_here, without_sb3_names
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
 
 SelfPlain = TypeVar("SelfPlain", bound="PlainAlgorithm")

@@ -25,7 +25,7 @@ from sb3_tbc.smdp.hindsight import GoalTest, check_goal_strategy
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.smdp.rewards import LowLevelReward
 from sb3_tbc.smdp.views import LevelViews
-from sb3_tbc.tbc_hrl import assembly, calls, resume
+from sb3_tbc.tbc_hrl import assembly, checks, resume
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
 from sb3_tbc.tbc_hrl.arguments import HierarchyArguments, SignatureOfSettings, TBCArguments, takes
 from sb3_tbc.tbc_hrl.collection import Collector, EpisodeStore
@@ -41,6 +41,7 @@ from sb3_tbc.tbc_hrl.diagnostics import (
 from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, in_fitting_vector, in_vector, reward_range
 from sb3_tbc.tbc_hrl.foreign_high import put_together
 from sb3_tbc.tbc_hrl.former_settings import take_settings
+from sb3_tbc.tbc_hrl.idle_settings import warn_of_idle_settings
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
 from sb3_tbc.tbc_hrl.live_settings import LiveSettings
 from sb3_tbc.tbc_hrl.policy import TBCPolicy
@@ -81,8 +82,8 @@ class TBCHRL(TwoLevelSaving):
 
     @takes(TBCArguments)
     def __init__(self, policy: str | type[BasePolicy], env: GymEnv | str | None, **arguments: object) -> None:
-        calls.refuse_policy(policy, self.policy_aliases)
-        calls.refuse_level_names(arguments := calls.without_sb3_names(arguments))
+        checks.refuse_policy(policy, self.policy_aliases)
+        checks.refuse_level_names(arguments := checks.without_sb3_names(arguments))
         others, settings = HierarchyArguments.taken_from(arguments)
         config = self.config_class.from_dict(settings)
         super().__init__(
@@ -109,7 +110,7 @@ class TBCHRL(TwoLevelSaving):
         self.collector: Collector | None = None
         self._resumed: Plain = {}
         if others._init_setup_model:
-            calls.refuse_no_environment(env)
+            checks.refuse_no_environment(env)
             self._setup_model()
 
     @property
@@ -154,15 +155,15 @@ class TBCHRL(TwoLevelSaving):
             """A setting by its name, as ``model.max_options``: short for ``model.config.max_options``."""
             if name in hints(type(self).config_class) and "config" in self.__dict__:
                 return getattr(self.config, name)
-            calls.explain_level_setting(name)
+            checks.explain_level_setting(name)
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
         def __setattr__(self, name: str, value: object) -> None:
             """Set a setting that can still change, see :data:`.CHANGEABLE_LATER`; refuse what would change nothing."""
-            if name in calls.OF_A_LEVEL:  # set in every step: a call costs more than the look
-                calls.refuse_level_setting(name, value)
-            elif name in calls.OF_THE_AGENT and "collector" in self.__dict__:
-                calls.refuse_fixed(name, value)
+            if name in checks.OF_A_LEVEL:  # set in every step: a call costs more than the look
+                checks.refuse_level_setting(name, value)
+            elif name in checks.OF_THE_AGENT and "collector" in self.__dict__:
+                checks.refuse_fixed(name, value)
                 return self._change(name, value)
             return super().__setattr__(name, value)
 
@@ -225,7 +226,7 @@ class TBCHRL(TwoLevelSaving):
 
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""
-        calls.refuse_vec_normalize(env)
+        checks.refuse_vec_normalize(env)
         check_goal_test(env)
         if self.subgoals is None:
             self.subgoals = attribute_of(env, "subgoals")
@@ -281,8 +282,8 @@ class TBCHRL(TwoLevelSaving):
         """
         self._refuse_foreign_high("learn")
         assembly.refuse_small_buffers(self.config, self.episode_length)
-        self.config.warn_before_learning()
-        total_timesteps = calls.whole_steps(total_timesteps)
+        warn_of_idle_settings(self.config)
+        total_timesteps = checks.whole_steps(total_timesteps)
         if self.env is None:
             raise ValueError("learn needs an environment: pass env to load, or call set_env first")
         resumed, self._resumed = {} if reset_num_timesteps else self._resumed, {}

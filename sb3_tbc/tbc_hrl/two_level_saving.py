@@ -19,7 +19,7 @@ from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.both_levels import Replay
 from sb3_tbc.settings import SettingError, plain
 from sb3_tbc.tbc_hrl import resume
-from sb3_tbc.tbc_hrl.calls import LEVEL_NAMES
+from sb3_tbc.tbc_hrl.checks import LEVEL_NAMES
 from sb3_tbc.tbc_hrl.collection import Collector
 from sb3_tbc.tbc_hrl.diagnostics import EpisodeDiagnostics
 from sb3_tbc.tbc_hrl.environment import mismatch_explained
@@ -55,8 +55,8 @@ class TwoLevelSaving(PlainAlgorithm):
         """What is needed to continue learning besides weights and replay: random streams, open options, counters."""
         return resume.get_state(self._moving_parts())
 
-    def _moving_parts(self) -> resume.LearningState:
-        return resume.LearningState(
+    def _moving_parts(self) -> resume.MovingParts:
+        return resume.MovingParts(
             self.num_timesteps, self.high, self.low, self.replay_buffer, self.policy.rng, self.rng, self.reachability,
             self.diagnostics, self.collector,
         )  # fmt: skip

@@ -26,6 +26,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.settings import Increasing, Prefixed, Range, SettingError, Settings, describe, entries, read
 from sb3_tbc.tbc_hrl.config import FlatConfig, HACConfig, HiTSConfig, TBCConfig
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+from sb3_tbc.tbc_hrl.idle_settings import warn_of_idle_settings
 from sb3_tbc.tbc_hrl.level_config import HighConfig, LowConfig, LowPolicyConfig
 from sb3_tbc.zoo import schema
 from sb3_tbc.zoo.algorithms import algorithm
@@ -301,7 +302,7 @@ def test_a_bonus_and_a_critic_that_cannot_be_positive_exclude_each_other(given: 
 def test_settings_that_change_nothing_are_named_before_learning(given: dict[str, Any], named: str) -> None:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        TBCConfig.from_dict(given).warn_before_learning()
+        warn_of_idle_settings(TBCConfig.from_dict(given))
     assert len(said) == bool(named)
     assert all(re.search(named, str(warning.message)) for warning in said)
 
@@ -312,7 +313,7 @@ def test_no_shipped_setting_changes_nothing(algo: str) -> None:
         warnings.simplefilter("error")
         for task, config in itertools.product((*task_names(), "PointMaze"), CONFIGS):
             settings = {k: v for k, v in load_config(algo, task, config).model.items() if k != "policy"}
-            algorithm(algo).config_class.from_dict(settings).warn_before_learning()  # type: ignore[union-attr]
+            warn_of_idle_settings(algorithm(algo).config_class.from_dict(settings))  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(
