@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from sb3_tbc.arrays import Float32
+from sb3_tbc.arrays import BoolArray, Float32, FloatArray, IntArray
 from sb3_tbc.errors import HierarchyError
 from sb3_tbc.replay.batch import LevelBatch
 from sb3_tbc.replay.ring import RingBuffer
@@ -91,7 +90,7 @@ class OptionReplayBuffer(RingBuffer):
         *batch, labels_ = (th.from_numpy(part).view(shape).to(self.device) for part in parts)
         return LevelBatch(*batch), labels_
 
-    def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
+    def _rows(self, at: IntArray) -> tuple[Float32, ...]:
         return self._batch(self._take(at))
 
     @staticmethod
@@ -204,35 +203,37 @@ class SubgoalReplayBuffer(RingBuffer):
         first = self.views.subgoals.reached(way, goal[:, None]).argmax(axis=1) + 1  # the goal itself is on the way
         return ReachPairs(data["local"][at], data["here"][at], goal, first.astype(np.float32))
 
-    def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
-        at, where, second = self._timed(at) if self.hindsight == "timed" else self._untimed(at)
-        taken = self._take(at)
-        subgoal, time_left, rewards, dones = (taken[name] for name in ("subgoal", "time_left", "rewards", "dones"))
-        subgoal[where] = self.data["achieved"][second]
-        expired = second == at[where]
-        if self.hindsight == "timed":
-            ahead = (second - at[where]) % self.buffer_size
-            early = self.rng.random(len(where), dtype=np.float32)
-            time_left[where, 0] = ahead + 1 - (0.0 if self.rules.whole_budgets else early)
-        here, achieved = taken["here"], taken["achieved"]
-        may_end = taken["position"][where, 0] + 1 >= self.rules.dt_min
-        rewards[where, 0], dones[where, 0] = self._relabelled(
-            here[where], achieved[where], subgoal[where], expired, may_end
-        )
+    def _rows(self, at: IntArray) -> tuple[Float32, ...]:
+        at, taken = self._with_hindsight(at)
+        subgoal, time_left, rewards = (taken[name] for name in ("subgoal", "time_left", "rewards"))
         scale = np.float32(1.0 / self.rules.dt_max)
         now, later = (np.clip(t * scale, 0.0, 1.0) for t in (time_left, time_left - 1.0))
-        observations = self.views.low_from(taken["local"], here, subgoal, now)
         return (
-            observations,
+            self.views.low_from(taken["local"], taken["here"], subgoal, now),
             taken["actions"],
-            self.views.low_from(taken["next_local"], achieved, subgoal, later),
+            self.views.low_from(taken["next_local"], taken["achieved"], subgoal, later),
             rewards,
-            dones,
+            taken["dones"],
             np.full_like(rewards, self.gamma),
             *self._memory(at, taken),
         )
 
-    def _timed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def _with_hindsight(self, at: IntArray) -> tuple[IntArray, dict[str, Float32]]:
+        """The rows to sample, and what they hold: a share of them with subgoal, time, reward and end of hindsight."""
+        at, where, second = self._timed(at) if self.hindsight == "timed" else self._untimed(at)
+        taken = self._take(at)
+        taken["subgoal"][where] = self.data["achieved"][second]
+        if self.hindsight == "timed":
+            ahead = (second - at[where]) % self.buffer_size
+            early = self.rng.random(len(where), dtype=np.float32)
+            taken["time_left"][where, 0] = ahead + 1 - (0.0 if self.rules.whole_budgets else early)
+        here, achieved, subgoal = (taken[name][where] for name in ("here", "achieved", "subgoal"))
+        may_end = taken["position"][where, 0] + 1 >= self.rules.dt_min
+        rewards, dones = self._relabelled(here, achieved, subgoal, second == at[where], may_end)
+        taken["rewards"][where, 0], taken["dones"][where, 0] = rewards, dones
+        return at, taken
+
+    def _timed(self, at: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """Rows to sample, which of them are relabelled, and the rows whose outcome becomes their subgoal."""
         share = self.n_hindsight_goals / (self.n_hindsight_goals + 1.0)
         where = np.flatnonzero(self.rng.random(len(at)) < share)
@@ -246,7 +247,7 @@ class SubgoalReplayBuffer(RingBuffer):
         at[where] = (begin + first) % self.buffer_size
         return at, where, (begin + second) % self.buffer_size
 
-    def _untimed(self, at: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def _untimed(self, at: IntArray) -> tuple[IntArray, IntArray, IntArray]:
         """The same for goals without time: the rows stay, only their subgoals are drawn."""
         position, length = (self.data[name][at, 0].astype(np.int64) for name in ("position", "length"))
         begin = at - position
@@ -262,15 +263,15 @@ class SubgoalReplayBuffer(RingBuffer):
         here: Float32,
         achieved: Float32,
         subgoal: Float32,
-        expired: NDArray[np.bool_],
-        may_end: NDArray[np.bool_],
-    ) -> tuple[NDArray[np.floating], NDArray[np.bool_]]:
+        expired: BoolArray,
+        may_end: BoolArray,
+    ) -> tuple[FloatArray, BoolArray]:
         """Rewards and ends of relabelled steps."""
         if self.reward.kind == "sparse" and not self.rules.ends_when_reached:
             return expired.astype(np.float32), expired  # the point reached at the end is the subgoal
         return self.reward.rewards_and_ends(here, achieved, subgoal, expired, may_end)
 
-    def _memory(self, at: NDArray[np.int64], taken: dict[str, Float32]) -> tuple[Float32, Float32, Float32]:
+    def _memory(self, at: IntArray, taken: dict[str, Float32]) -> tuple[Float32, Float32, Float32]:
         """Memory before and after the sampled steps, and the steps before them, as :class:`.LevelBatch` has these.
 
         :param taken: the sampled rows, with the subgoals and times that they are relabelled with
@@ -290,7 +291,7 @@ class SubgoalReplayBuffer(RingBuffer):
         states = self.data["states"][(at - back) % self.buffer_size]
         return states, taken["next_states"], earlier.reshape(len(at), -1)
 
-    def _intact(self, begin: NDArray[np.int64], length: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def _intact(self, begin: IntArray, length: IntArray) -> BoolArray:
         """Which windows still have all their rows; the one at the write position is partly overwritten.
 
         :param begin: their first rows; below 0 where a window ran across the end of a ring, or its first rows were
