@@ -7,14 +7,14 @@ from typing import Protocol
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from stable_baselines3.common.preprocessing import get_action_dim
 from torch import nn
 
-from sb3_tbc.arrays import FloatArray, FloatType
+from sb3_tbc.arrays import BoolArray, FloatArray, FloatType
 from sb3_tbc.level.actors import GaussianHead, GRUActor, GRUNet, MLPActor, NDBCActor
 from sb3_tbc.level.policies import LevelActor, LevelPolicy
 from sb3_tbc.level.storage import Block, in_one_piece
+from sb3_tbc.ndbc.frozen import FrozenNDBC
 
 
 def _relu(x: FloatArray) -> FloatArray:
@@ -129,8 +129,6 @@ def freeze(actor: LevelActor, dtype: FloatType = np.float32) -> FrozenNet:
     :raises TypeError: for another kind of actor
     """
     if isinstance(actor, NDBCActor):
-        from sb3_tbc.ndbc.frozen import FrozenNDBC
-
         return FrozenNDBC(actor.net)
     if isinstance(actor, GRUActor):
         return FrozenGRU(actor.net)
@@ -192,7 +190,7 @@ class FrozenActor:
         self,
         observations: FloatArray,
         states: FloatArray,
-        deterministic: bool | NDArray[np.bool_],
+        deterministic: bool | BoolArray,
         rng: np.random.Generator,
     ) -> tuple[FloatArray, FloatArray]:
         """See :meth:`ActingLevel.act`."""
@@ -253,7 +251,7 @@ class ActingLevel:
         self,
         observations: FloatArray,
         states: FloatArray,
-        deterministic: bool | NDArray[np.bool_],
+        deterministic: bool | BoolArray,
         rng: np.random.Generator,
         average: bool = False,
     ) -> tuple[FloatArray, FloatArray]:

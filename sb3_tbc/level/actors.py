@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch as th
 from gymnasium import spaces
@@ -24,9 +24,8 @@ from torch.nn import functional
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.level.storage import Block, linear_layers
-
-if TYPE_CHECKING:
-    from sb3_tbc.ndbc import NDBCNet
+from sb3_tbc.ndbc.network import NDBCNet
+from sb3_tbc.ndbc.wiring import WIRING_KEYS, NDBCWiring
 
 SQUASH_EPSILON = 1e-6
 """Added inside the logarithm of tanh's derivative, as SB3 does."""
@@ -258,9 +257,6 @@ class NDBCActor(MemoryActor):
 
     def make_net(self, n_inputs: int, n_outputs: int) -> Any:
         """The circuit, a :class:`~sb3_tbc.ndbc.NDBCNet`."""
-        from sb3_tbc.ndbc import NDBCNet, NDBCWiring
-        from sb3_tbc.ndbc.wiring import WIRING_KEYS
-
         wiring = NDBCWiring(n_inputs, **{k: v for k, v in self.settings.items() if k in WIRING_KEYS})
         return NDBCNet(n_inputs, n_outputs, wiring, **{k: v for k, v in self.settings.items() if k not in WIRING_KEYS})
 
