@@ -25,7 +25,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.ndbc.extractor import input_scale_of
 from sb3_tbc.recurrent.cells import NDBCCell, make_cell
 from sb3_tbc.recurrent.sequences import SequenceReplayBuffer, Sequences, flat, flat_space, refuse_non_finite
-from sb3_tbc.tbc_hrl.environment import episode_starts
+from sb3_tbc.tbc_hrl.checks import episode_starts
 from sb3_tbc.tbc_hrl.last_step import KeepsLastStep
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 

@@ -6,13 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 import torch as th
-from numpy.typing import NDArray
 from stable_baselines3.common.buffers import BaseBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_tbc.aliases import Space
-from sb3_tbc.arrays import AnyArray, Arrays, Float32
+from sb3_tbc.arrays import AnyArray, Arrays, Float32, Indices, IntArray
 from sb3_tbc.replay.batch import LevelBatch
 
 
@@ -54,7 +53,7 @@ class RingBuffer(BaseBuffer):
         """Views of whole rows ``(n, .)``, one per quantity."""
         return {name: rows[:, columns] for name, columns in self._columns.items()}
 
-    def _take(self, at: NDArray[np.int64]) -> dict[str, Float32]:
+    def _take(self, at: IntArray) -> dict[str, Float32]:
         """Copies of rows, by quantity."""
         return self._split(self._table.take(at, axis=0))
 
@@ -92,13 +91,13 @@ class RingBuffer(BaseBuffer):
         """One batch in SB3's form."""
         return self._get_samples(self.rng.integers(0, self.size(), batch_size))
 
-    def _get_samples(self, batch_inds: NDArray[np.intp], env: VecNormalize | None = None) -> ReplayBufferSamples:
+    def _get_samples(self, batch_inds: Indices, env: VecNormalize | None = None) -> ReplayBufferSamples:
         parts = LevelBatch(*(th.from_numpy(part).to(self.device) for part in self._rows(batch_inds)))
         return ReplayBufferSamples(
             parts.observations, parts.actions, parts.next_observations, parts.dones, parts.rewards, parts.discounts
         )
 
-    def _rows(self, at: NDArray[np.int64]) -> tuple[Float32, ...]:
+    def _rows(self, at: IntArray) -> tuple[Float32, ...]:
         raise NotImplementedError
 
     def get_state(self) -> Arrays:

@@ -11,9 +11,8 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sb3_tbc.arrays import BoolArray, FloatArray
+from sb3_tbc.arrays import BoolArray, FloatArray, IntArray
 from sb3_tbc.smdp.options import Episode, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
@@ -38,7 +37,7 @@ class GoalTest(NamedTuple):
     """A task's reward and termination as batched functions of ``(achieved_goal, desired_goal)``."""
 
     reward: Callable[[FloatArray, FloatArray], FloatArray]  # (n, goal_dim) x 2 -> (n,)
-    terminated: Callable[[FloatArray, FloatArray], NDArray[np.bool_]]  # (n, goal_dim) x 2 -> (n,)
+    terminated: Callable[[FloatArray, FloatArray], BoolArray]  # (n, goal_dim) x 2 -> (n,)
 
 
 class LowLevelSteps(NamedTuple):
@@ -53,10 +52,10 @@ class LowLevelSteps(NamedTuple):
     here: FloatArray  # (T, subgoal_dim) subgoal-space point before the step
     achieved: FloatArray  # and after it
     time_left: FloatArray  # (T,) steps of the budget left before the step
-    position: NDArray[np.int64]  # (T,) steps since the window began
-    length: NDArray[np.int64]  # (T,) steps the window took
+    position: IntArray  # (T,) steps since the window began
+    length: IntArray  # (T,) steps the window took
     rewards: FloatArray  # (T,)
-    dones: NDArray[np.bool_]  # (T,) the window is over: no bootstrap
+    dones: BoolArray  # (T,) the window is over: no bootstrap
 
 
 def low_level_steps(episode: Episode, reward: LowLevelReward) -> LowLevelSteps:
@@ -94,7 +93,7 @@ def low_level_steps(episode: Episode, reward: LowLevelReward) -> LowLevelSteps:
     )
 
 
-def ordered_pairs(length: NDArray[np.int64], rng: np.random.Generator) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def ordered_pairs(length: IntArray, rng: np.random.Generator) -> tuple[IntArray, IntArray]:
     """A uniformly drawn pair ``0 <= first <= second < length`` for each window length, ``(n,)`` each."""
     first = rng.integers(0, length)
     second = rng.integers(0, length + 1)
@@ -110,10 +109,10 @@ class HighLevelSteps(NamedTuple):
     actions: FloatArray  # (n, subgoal_dim + 1) subgoal and time budget, unit coordinates
     rewards: FloatArray  # (n,)
     next_observations: FloatArray
-    dones: NDArray[np.bool_]  # (n,) no bootstrap
+    dones: BoolArray  # (n,) no bootstrap
     discounts: FloatArray  # (n,) of the value after the option
-    relabelled: NDArray[np.bool_]  # (n,) whether the action is a hindsight one
-    durations: NDArray[np.int64]  # (n,) environment steps
+    relabelled: BoolArray  # (n,) whether the action is a hindsight one
+    durations: IntArray  # (n,) environment steps
     local: FloatArray  # (n, local_dim) what the low level saw when the option began
     here: FloatArray  # (n, subgoal_dim) and the subgoal-space point where it began
 
@@ -135,7 +134,7 @@ def relabel_actions(
     rules: OptionRules,
     rng: np.random.Generator,
     tolerance: float | None = None,
-) -> tuple[FloatArray, NDArray[np.bool_]]:
+) -> tuple[FloatArray, BoolArray]:
     """The action each option turned out to be, ``(n_options, subgoal_dim + 1)``, and which of them changed.
 
     An achieved option keeps its action; another becomes (point reached, time it took), with the time drawn so that
@@ -166,7 +165,7 @@ def relabel_actions(
     return actions, failed
 
 
-def hindsight_success(reached: FloatArray, subgoal: FloatArray, tolerance: float = 0.05) -> NDArray[np.bool_]:
+def hindsight_success(reached: FloatArray, subgoal: FloatArray, tolerance: float = 0.05) -> BoolArray:
     """Whether relabelled options succeed: ``||phi(s') - phi(g_hat)||_2 <= tolerance`` (paper section 4.5), ``(n,)``.
 
     :param reached: where the options ended, unit coordinates ``(n, subgoal_dim)``
@@ -191,7 +190,7 @@ def failed_tests(episode: Episode) -> BoolArray:
 
 def goal_pairs(
     n_options: int, n_goals: int, strategy: str, rng: np.random.Generator, event: int | None = None
-) -> NDArray[np.int64]:
+) -> IntArray:
     """Rows ``(option, option whose outcome becomes its goal)`` for hindsight goal relabelling, ``(n, 2)``.
 
     ``"future"`` draws from the later options of the episode, never an option's own outcome (as HiTS and HAC);
@@ -307,7 +306,7 @@ class _TransitionSource:
         gained = self._charged(self.rewards, o.actions) + self.bonus
         return self._steps(rows, o.actions[rows], gained[rows], o.dones[rows], o.durations[rows], True)
 
-    def with_hindsight_goals(self, pairs: NDArray[np.int64], goal_test: GoalTest, at_end: bool) -> HighLevelSteps:
+    def with_hindsight_goals(self, pairs: IntArray, goal_test: GoalTest, at_end: bool) -> HighLevelSteps:
         """Options under their hindsight actions and hindsight goals.
 
         :param pairs: from :func:`goal_pairs`
@@ -326,11 +325,11 @@ class _TransitionSource:
 
     def _steps(
         self,
-        rows: NDArray[np.int64],
+        rows: IntArray,
         actions: FloatArray,
         rewards: FloatArray,
         dones: BoolArray,
-        durations: NDArray[np.int64],
+        durations: IntArray,
         relabelled: bool,
         goals: FloatArray | None = None,
     ) -> HighLevelSteps:
@@ -348,14 +347,14 @@ class RelabelledGoals(NamedTuple):
     """Reward, end and length of windows under other goals."""
 
     rewards: FloatArray
-    dones: NDArray[np.bool_]
-    durations: NDArray[np.int64]
+    dones: BoolArray
+    durations: IntArray
 
 
 def relabel_goals(
     episode: Episode,
-    starts: NDArray[np.int64],
-    durations: NDArray[np.int64],
+    starts: IntArray,
+    durations: IntArray,
     goals: FloatArray,
     reward: HighLevelReward,
     goal_test: GoalTest,
@@ -380,7 +379,7 @@ def relabel_goals(
     last = offsets + durations - 1
     if at_end:
         return RelabelledGoals(reward.window_rewards(step_rewards, offsets, durations), met[last], durations)
-    met_before: NDArray[np.int64] = np.cumsum(met) - met
+    met_before: IntArray = np.cumsum(met) - met
     over = met_before - np.repeat(met_before[offsets], durations) > 0
     rewards = reward.window_rewards(np.where(over, 0.0, step_rewards), offsets, durations)
     dones = np.logical_or.reduceat(met, offsets)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, Indices, IntArray
 from sb3_tbc.smdp.options import Episode, Option, TerminationReason
@@ -40,7 +39,7 @@ class EpisodeRecorder:
         }
         self._rewards = np.zeros((n_envs, FIRST_ROWS))
 
-    def begin(self, indices: NDArray[np.intp], observation: GoalObservation) -> None:
+    def begin(self, indices: Indices, observation: GoalObservation) -> None:
         """Start new episodes; the arrays have one row per entry of ``indices``."""
         self.steps[indices] = 0
         for index in indices:

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import BoolArray, FloatArray, IntArray
 from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.smdp.spaces import SubgoalSpace
 
@@ -48,9 +47,9 @@ class LowLevelReward:
         here: FloatArray,
         achieved: FloatArray,
         subgoal: FloatArray,
-        expired: NDArray[np.bool_],
-        may_end: NDArray[np.bool_] | bool = True,
-    ) -> tuple[FloatArray, NDArray[np.bool_]]:
+        expired: BoolArray,
+        may_end: BoolArray | bool = True,
+    ) -> tuple[FloatArray, BoolArray]:
         """Rewards ``(n,)`` and whether the low level's problem is over ``(n,)``.
 
         :param here: subgoal-space points before the steps, ``(n, subgoal_dim)``
@@ -102,9 +101,7 @@ class HighLevelReward:
         """Discount per environment step."""
         return float(self.gamma ** (1.0 / self.dt_ref)) if self.target == "smdp" else 1.0
 
-    def window_rewards(
-        self, step_rewards: FloatArray, starts: NDArray[np.int64], durations: NDArray[np.int64]
-    ) -> FloatArray:
+    def window_rewards(self, step_rewards: FloatArray, starts: IntArray, durations: IntArray) -> FloatArray:
         """Reward of windows that lie one behind the other in ``step_rewards``, before the duration cost, ``(n,)``."""
         if self.target == "decision":
             return np.asarray(step_rewards[starts + durations - 1], dtype=np.float64)
@@ -114,16 +111,14 @@ class HighLevelReward:
         """What time budgets in steps cost, ``(n,)``: the duration cost."""
         return np.asarray(self.duration_cost * time_budgets / self.dt_max)
 
-    def discounts(self, durations: NDArray[np.int64]) -> FloatArray:
+    def discounts(self, durations: IntArray) -> FloatArray:
         """Factor of the next state's value for windows of these lengths, ``(n,)``."""
         if self.target == "decision":
             return np.full(len(durations), self.gamma)
         return np.asarray(self.gamma_step**durations)
 
 
-def discounted_sums(
-    step_rewards: FloatArray, starts: NDArray[np.int64], durations: NDArray[np.int64], gamma: float
-) -> FloatArray:
+def discounted_sums(step_rewards: FloatArray, starts: IntArray, durations: IntArray, gamma: float) -> FloatArray:
     """``sum_j gamma^j r_(start + j)`` of each window; windows must cover ``step_rewards`` in order (paper, R(dt))."""
     within = np.arange(len(step_rewards)) - np.repeat(starts, durations)
     return np.add.reduceat(step_rewards * gamma**within, starts)

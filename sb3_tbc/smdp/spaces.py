@@ -9,10 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sb3_tbc.aliases import Plain, Space
-from sb3_tbc.arrays import AnyArray, FloatArray
+from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
 
 GoalObservation = Mapping[str, AnyArray]
 """A goal environment's observation: ``observation``, ``achieved_goal``, ``desired_goal``, single or batched."""
@@ -252,7 +252,7 @@ class SubgoalSpace:
         """The low level's view of a goal observation, ``(..., local_dim)``, task units."""
         return self._local(observation)
 
-    def reached(self, achieved: FloatArray, subgoal: FloatArray) -> NDArray[np.bool_]:
+    def reached(self, achieved: FloatArray, subgoal: FloatArray) -> BoolArray:
         """Whether ``achieved`` lies within the thresholds of ``subgoal`` (strictly, as in HiTS), ``(...)``."""
         difference = achieved - subgoal
         if len(self.groups) == self.dim:
@@ -264,7 +264,7 @@ class SubgoalSpace:
             distances[index] = angle_between(achieved[..., group], subgoal[..., group])
         return np.asarray((np.stack(distances, axis=-1) < self.thresholds).all(axis=-1))
 
-    def happened(self, observation: GoalObservation) -> NDArray[np.bool_]:
+    def happened(self, observation: GoalObservation) -> BoolArray:
         """Whether the decisive event happened in the step that led to ``observation``, ``(...)``; never without one."""
         if self.event is None:
             return np.zeros(observation["observation"].shape[:-1], dtype=bool)

@@ -7,11 +7,17 @@ from collections.abc import Iterable
 from numbers import Integral, Real
 from typing import Any
 
+import numpy as np
 import torch as th
+from gymnasium import spaces
+from numpy.typing import ArrayLike
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
 from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import Arrays, BoolArray
 from sb3_tbc.settings import SettingError, hints
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, width
+from sb3_tbc.tasks.layouts import layout_cure
 from sb3_tbc.tbc_hrl.config import TBCConfig
 
 
@@ -27,6 +33,39 @@ def whole_steps(total_timesteps: Any) -> int:
     if total_timesteps < 0:
         raise ValueError(f"total_timesteps must not be negative, got {total_timesteps}")
     return int(total_timesteps)
+
+
+def episode_starts(given: ArrayLike, n_envs: int) -> BoolArray:
+    """Which environments begin an episode, ``(n_envs,)``, as ``predict`` is told.
+
+    :param given: one entry for each environment, or one for all
+    :raises ValueError: for another number of them, which NumPy might spread over all environments
+    """
+    starts = np.asarray(given, dtype=bool)
+    if starts.ndim and starts.shape != (n_envs,):
+        raise ValueError(f"episode_start has one entry for each of {n_envs} environments, got shape {starts.shape}")
+    return np.broadcast_to(starts, n_envs)
+
+
+def check_sizes(space: spaces.Dict, batch: Arrays) -> None:
+    """Refuse observations of another size than an agent was trained on.
+
+    :param space: the agent's observation space
+    :param batch: goal observations ``(..., size)``
+    :raises ValueError: with both sizes, and the layout to use where the task has one that fits
+    """
+    for key in GOAL_KEYS:
+        expected, shape = width(space, key), np.shape(batch[key])
+        given = shape[-1] if shape else 0
+        if given != expected or len(shape) > 2:
+            cure = layout_cure(expected, given) if key == "observation" else ""
+            raise ValueError(
+                f"this agent acts on {key} of shape ({expected},) or (n, {expected}), got {tuple(shape)}.{cure}"
+            )
+    counts = {key: np.shape(batch[key])[:-1] for key in GOAL_KEYS}
+    if len(set(counts.values())) > 1:
+        shapes = ", ".join(f"{key} {np.shape(batch[key])}" for key in counts)
+        raise ValueError(f"the parts of an observation must be of the same environments, got {shapes}")
 
 
 def device_here(device: th.device | str) -> th.device | str:

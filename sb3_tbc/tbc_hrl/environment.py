@@ -1,4 +1,4 @@
-"""What an agent asks of its environment: attributes of the task, and how long an episode lasts."""
+"""The vector that an agent learns in, and what it asks of it: attributes of the task, how long an episode lasts."""
 
 from __future__ import annotations
 
@@ -9,19 +9,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from numpy.typing import ArrayLike
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_tbc.arrays import Arrays, BoolArray
 from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import watch
-from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, width
 from sb3_tbc.smdp.goal_test import check_goal_test
 from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.tasks.layouts import layout_cure
@@ -88,39 +84,6 @@ def episode_length(env: VecEnv) -> int | None:
         wrapped = attribute_of(env, "_max_episode_steps")  # of the outermost TimeLimit
         limit = min(limit, int(wrapped)) if limit and wrapped else limit or wrapped
     return limit
-
-
-def episode_starts(given: ArrayLike, n_envs: int) -> BoolArray:
-    """Which environments begin an episode, ``(n_envs,)``, as ``predict`` is told.
-
-    :param given: one entry for each environment, or one for all
-    :raises ValueError: for another number of them, which NumPy might spread over all environments
-    """
-    starts = np.asarray(given, dtype=bool)
-    if starts.ndim and starts.shape != (n_envs,):
-        raise ValueError(f"episode_start has one entry for each of {n_envs} environments, got shape {starts.shape}")
-    return np.broadcast_to(starts, n_envs)
-
-
-def check_sizes(space: spaces.Dict, batch: Arrays) -> None:
-    """Refuse observations of another size than an agent was trained on.
-
-    :param space: the agent's observation space
-    :param batch: goal observations ``(..., size)``
-    :raises ValueError: with both sizes, and the layout to use where the task has one that fits
-    """
-    for key in GOAL_KEYS:
-        expected, shape = width(space, key), np.shape(batch[key])
-        given = shape[-1] if shape else 0
-        if given != expected or len(shape) > 2:
-            cure = layout_cure(expected, given) if key == "observation" else ""
-            raise ValueError(
-                f"this agent acts on {key} of shape ({expected},) or (n, {expected}), got {tuple(shape)}.{cure}"
-            )
-    counts = {key: np.shape(batch[key])[:-1] for key in GOAL_KEYS}
-    if len(set(counts.values())) > 1:
-        shapes = ", ".join(f"{key} {np.shape(batch[key])}" for key in counts)
-        raise ValueError(f"the parts of an observation must be of the same environments, got {shapes}")
 
 
 @contextlib.contextmanager

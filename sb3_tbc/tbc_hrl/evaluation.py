@@ -5,12 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tbc.aliases import Env
-from sb3_tbc.arrays import FloatArray
+from sb3_tbc.arrays import BoolArray, FloatArray, IntArray
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_spaces import goal_parts
 from sb3_tbc.smdp.guard import GuardedVecEnv
@@ -24,13 +23,13 @@ from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
 class EvaluationResult(NamedTuple):
     """One entry per evaluated episode, in the order of the environments and of their episodes."""
 
-    successes: NDArray[np.bool_]
-    lengths: NDArray[np.int64]  # environment steps
+    successes: BoolArray
+    lengths: IntArray  # environment steps
     rewards: FloatArray  # undiscounted sums
     subgoal_success: FloatArray  # share of options that reached their subgoal
     mean_window: FloatArray  # mean option length, environment steps
-    decisions: NDArray[np.int64]  # options used
-    budget_exhausted: NDArray[np.bool_]  # the episode failed because its action budget was used up
+    decisions: IntArray  # options used
+    budget_exhausted: BoolArray  # the episode failed because its action budget was used up
 
     @property
     def success_rate(self) -> float:

@@ -7,11 +7,10 @@ from typing import NamedTuple, cast
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import PyTorchObs, TensorDict
 
-from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray
+from sb3_tbc.arrays import AnyArray, Arrays, BoolArray, FloatArray, IntArray
 from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.level.actors import NDBCActor
 from sb3_tbc.level.level import SACLevel
@@ -22,7 +21,7 @@ from sb3_tbc.smdp.hierarchical_vec_env import Schedule
 from sb3_tbc.smdp.options import OptionClock, OptionRules
 from sb3_tbc.smdp.views import LevelViews
 from sb3_tbc.tbc_hrl.actor import TwoLevelActor
-from sb3_tbc.tbc_hrl.environment import check_sizes, episode_starts
+from sb3_tbc.tbc_hrl.checks import check_sizes, episode_starts
 from sb3_tbc.tbc_hrl.reconsideration import Reconsideration
 
 
@@ -31,8 +30,8 @@ class TwoLevelState(NamedTuple):
 
     subgoal: FloatArray  # (n, subgoal_dim), task units
     time_budget: FloatArray  # (n,), steps
-    elapsed: NDArray[np.int64]  # (n,), steps since the option began
-    used: NDArray[np.int64]  # (n,), options begun in this episode
+    elapsed: IntArray  # (n,), steps since the option began
+    used: IntArray  # (n,), options begun in this episode
     membrane: FloatArray  # (n, state_dim)
 
 
@@ -173,9 +172,7 @@ class TBCPolicy(BasePolicy):
             clock.begin(where, unit if self.schedule is None else self.schedule(unit, seen))
         return over
 
-    def _name_non_finite(
-        self, inputs: FloatArray, membrane: FloatArray, unit: FloatArray, elapsed: NDArray[np.int64]
-    ) -> None:
+    def _name_non_finite(self, inputs: FloatArray, membrane: FloatArray, unit: FloatArray, elapsed: IntArray) -> None:
         """Raise, naming where the low level stopped being finite; steps count from the beginning of the option."""
         row = int(np.flatnonzero(~np.isfinite(unit).all(axis=1))[0])
         actor, step, one = self.low_policy.actor, int(elapsed[row]), slice(row, row + 1)

@@ -102,13 +102,13 @@ class TBCHRL(TwoLevelSaving):
         self.episode_length: int | None = None
         self.reward_range: RewardRange | None = None
         self._n_updates = 0
-        self._updated_at = 0
-        self._counted_to: int | None = None
+        self._updated_at = 0  # num_timesteps at the last updates
+        self._counted_to: int | None = None  # num_timesteps after our last step; what others add owes no updates
         self._owed: dict[str, float] = {}  # updates still to be done, by level; may be fractions
         self._burst_due = 0  # episodes stored since the last updates
         self.stop_requested = False
         self.collector: Collector | None = None
-        self._resumed: Plain = {}
+        self._resumed: Plain = {}  # what load_replay_buffer read of a run, for learn to continue
         if others._init_setup_model:
             checks.refuse_no_environment(env)
             self._setup_model()
