@@ -137,7 +137,7 @@ def freeze(actor: LevelActor, dtype: FloatType = np.float32) -> FrozenNet:
     return FrozenMLP(actor, dtype)
 
 
-class Weights:
+class WeightWatch:
     """Notices that an actor's parameters were changed by hand: in place, or by other tensors in their place.
 
     :param actor: the actor
@@ -177,7 +177,7 @@ class FrozenActor:
         self._version = policy.weights_version
         self._dtype = np.float64 if average else np.float32
         self._net = freeze(actor, self._dtype)
-        self._weights = Weights(actor)
+        self._watch = WeightWatch(actor)
         head: GaussianHead = actor.head
         self._dim = get_action_dim(actor.action_space)
         mean_bound = np.inf if head.mean_bound is None else head.mean_bound
@@ -210,13 +210,13 @@ class FrozenActor:
     def _current(self) -> FrozenNet:
         if self._version != self._policy.weights_version:
             self._net.refresh()
-            self._weights.note()
+            self._watch.note()
             self._version = self._policy.weights_version
         return self._net
 
     def is_stale(self) -> bool:
         """Whether the weights were changed by hand since they were read."""
-        return self._version == self._policy.weights_version and self._weights.changed()
+        return self._version == self._policy.weights_version and self._watch.changed()
 
 
 _UNUSED = np.random.default_rng(0)

@@ -41,6 +41,9 @@ EXTREMES: dict[str, Callable[[float, float], float]] = {"target_min": min, "targ
 AVERAGE_DECAY = 0.999
 """Default decay per update of the averaged actor; in the n-th update at most (1 + n) / (10 + n)."""
 
+ACTOR, CRITIC, TEMPERATURE = range(3)
+"""Places in :meth:`SACUpdate.optimizers` and :attr:`LearntState.moments`."""
+
 
 class SACUpdate:
     """The update of one level: flat storage for its policy, and the step that changes it.
@@ -271,16 +274,16 @@ class SACUpdate:
         surplus = (log_prob.detach() + row.target_entropy).mean()
 
         critic_grad, critic_diagnostics = self._critic_gradient(x, ent_coef)
-        self._adam(1, state, critic_grad, row)
+        self._adam(CRITIC, state, critic_grad, row)
         # The actor's loss looks through the critics that were just changed, as in SB3.
         actor_loss = self._actor_loss(x, actions_pi, log_prob, ent_coef)
         (actor_grad,) = th.autograd.grad(actor_loss, actor_leaf)
-        self._adam(0, state, actor_grad, row)
+        self._adam(ACTOR, state, actor_grad, row)
         # The temperature last, so that nothing changes while both forward passes of the actor share what they compute;
         # the losses use its value from before the update, as in SB3.
         ent_coef_loss = -(state.ent * surplus).sum() if self.automatic else state.ent.new_zeros(())
         if self.automatic:
-            self._adam(2, state, -surplus.expand(1), row)
+            self._adam(TEMPERATURE, state, -surplus.expand(1), row)
         if self.statistics is None:
             state.target.lerp_(state.critic, row.tau)
         else:  # CrossQ has no target networks
@@ -421,7 +424,7 @@ class SACUpdate:
     def _adam(self, which: int, state: LearntState, grad: th.Tensor, row: Schedules) -> None:
         """One step of Adam in place (arXiv 1412.6980).
 
-        :param which: 0 for the actor, 1 for the critics, 2 for the temperature
+        :param which: :data:`ACTOR`, :data:`CRITIC` or :data:`TEMPERATURE`
         """
         # theta -= lr / (1 - beta1^n) * m / (sqrt(v) / sqrt(1 - beta2^n) + eps): the corrections depend on the number
         # of updates n, so they come in as tensors, and one compiled graph serves all updates.

@@ -285,8 +285,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         self._last_windows.note(where)
 
     def _low_observation(self, observation: GoalObservation) -> FloatArray:
-        remaining = self.rules.remaining(self.clock.time_left)
-        return self.views.low(observation, self.clock.subgoal, remaining)
+        return self.views.low(observation, self.clock.subgoal, self.clock.remaining)
 
 
 CUT_OFF = tuple(

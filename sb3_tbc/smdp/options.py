@@ -215,6 +215,11 @@ class OptionClock:
         return self.time_budget - self.elapsed
 
     @property
+    def remaining(self) -> FloatArray:
+        """Remaining time as the low level sees it, in [0, 1], ``(n_envs,)``."""
+        return self.rules.remaining(self.time_left)
+
+    @property
     def expired(self) -> BoolArray:
         """Whose time budget is spent, ``(n_envs,)``."""
         return np.asarray(self.elapsed >= self.time_budget)

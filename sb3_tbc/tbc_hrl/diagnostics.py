@@ -1,4 +1,4 @@
-"""Running means that explain learning: what each level did since the last log."""
+"""What learning tells: means of what each level did, SB3's keys of progress, settings, and the progress bar."""
 
 from __future__ import annotations
 

@@ -131,11 +131,9 @@ class OptionEnv(CopyableVecEnvWrapper):
 
     def _act(self, live: Indices) -> AnyArray:
         """The low level's actions in the environments whose option is running."""
-        policy, seen = self.policy, rows_of(self._seen, live)
-        remaining = policy.rules.remaining(self.clock.time_left[live])
-        observation = policy.views.low(seen, self.clock.subgoal[live], remaining)
-        unit, after = policy.actor.act(observation, self._membrane[live], self.deterministic, self.rng)
-        self._membrane[live] = after
+        policy, clock = self.policy, self.clock
+        observation = policy.views.low(rows_of(self._seen, live), clock.subgoal[live], clock.remaining[live])
+        unit, self._membrane[live] = policy.actor.act(observation, self._membrane[live], self.deterministic, self.rng)
         actions: AnyArray = policy.unit.unscale(unit)
         return actions
 

@@ -123,7 +123,7 @@ class TBCPolicy(BasePolicy):
         if episode_start is not None:
             starts |= episode_starts(episode_start, n)
         over = self._begin_options(clock, batch, starts, deterministic)
-        low_observation = self.views.low(batch, clock.subgoal, self.rules.remaining(clock.time_left))
+        low_observation = self.views.low(batch, clock.subgoal, clock.remaining)
         membrane = self.actor.forget(membrane, over, starts)
         unit, membrane = self.actor.act(low_observation, membrane, deterministic, self.rng)
         if not np.isfinite(unit).all():
