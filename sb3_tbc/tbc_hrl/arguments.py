@@ -22,7 +22,8 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.settings import Range, SettingError, Settings, default_of, hints
 from sb3_tbc.smdp.spaces import SubgoalSpace
-from sb3_tbc.tbc_hrl.config import AgentConfig, FlatConfig, HighConfig, LowConfig
+from sb3_tbc.tbc_hrl.config import AgentConfig, FlatConfig
+from sb3_tbc.tbc_hrl.level_config import HighConfig, LowConfig
 
 P = ParamSpec("P")
 SelfArguments = TypeVar("SelfArguments", bound="SB3Arguments")

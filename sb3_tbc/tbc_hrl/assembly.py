@@ -19,8 +19,8 @@ from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
 from sb3_tbc.smdp.views import LevelViews
 from sb3_tbc.tbc_hrl.collection import Exploration
-from sb3_tbc.tbc_hrl.config import LevelConfig, TBCConfig
-from sb3_tbc.tbc_hrl.level_config import learning_rate_of
+from sb3_tbc.tbc_hrl.config import TBCConfig
+from sb3_tbc.tbc_hrl.level_config import LevelConfig, learning_rate_of
 from sb3_tbc.tbc_hrl.reachability import Reachability
 from sb3_tbc.tbc_hrl.scheduling import DurationTeacher, FixedWindows, ReachRule
 

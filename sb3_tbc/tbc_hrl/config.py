@@ -13,7 +13,6 @@ from typing import Annotated, Literal, Self
 
 from sb3_tbc.settings import Range, SettingError, Settings
 from sb3_tbc.tbc_hrl.level_config import (
-    CircuitConfig,
     Fraction,
     HighConfig,
     LearningRate,
@@ -22,27 +21,12 @@ from sb3_tbc.tbc_hrl.level_config import (
     LowPolicyConfig,
     NetArch,
     NotNegative,
-    PolicyConfig,
     Positive,
     Price,
     Temperature,
     UpdateRatio,
     Width,
 )
-
-__all__ = [
-    "CircuitConfig",
-    "FlatConfig",
-    "HACConfig",
-    "HiTSConfig",
-    "HighConfig",
-    "LevelConfig",
-    "LowConfig",
-    "LowPolicyConfig",
-    "PolicyConfig",
-    "TBCConfig",
-]
-
 
 WINDOW_STEPS = 10
 """Steps of an episode for each decision with ``max_options: auto``: time for the low level to do something."""

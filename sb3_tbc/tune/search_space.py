@@ -18,7 +18,7 @@ from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.reading import SettingsLoader, read_yaml
 from sb3_tbc.settings import merge
-from sb3_tbc.tbc_hrl.config import CircuitConfig
+from sb3_tbc.tbc_hrl.level_config import CircuitConfig
 from sb3_tbc.zoo.config import RunConfig, changed, nested
 from sb3_tbc.zoo.schema import CONFIG_CLASSES, RUN, validate
 

@@ -13,8 +13,8 @@ from corridor import Corridor
 from sb3_tbc import NDBCSAC, TBCHRL
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.settings import SettingError
-from sb3_tbc.tbc_hrl.config import LowConfig
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+from sb3_tbc.tbc_hrl.level_config import LowConfig
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
 LEVEL: dict[str, Any] = {"batch_size": 8, "buffer_size": 500, "policy_kwargs": {"net_arch": [8]}}
