@@ -15,6 +15,9 @@ from sb3_tbc.pretrained import is_pretrained, model_path
 from sb3_tbc.zoo.algorithms import load_two_levels
 
 SUFFIXES = {"onnx": ".onnx", "c": ".c", "numpy": ".py"}
+HEAD_BYTES = 2000
+MARKS = (b", exported from sb3_tbc. ", b"\x12\x07sb3_tbc")
+"""One of these is among the first bytes of a file that this command wrote: texts say so, ONNX names its producer."""
 
 
 EXAMPLES = {
@@ -42,6 +45,29 @@ def build_parser() -> Parser:
     parser.add_argument("--seed", type=seed_number, default=0, help="seed of the episodes of --check")
     add_trust(parser)
     return parser
+
+
+def default_output(model: Path, suffix: str) -> Path:
+    """Where an export goes without ``--output``: beside the agent, of the package's own agents the working directory.
+
+    An agent often has the name of the program that trained it: a file that is none of ours is not replaced unasked.
+
+    :raises ConfigError: if there is such a file
+    """
+    name = model.with_suffix(suffix)
+    path = Path(name.name) if is_pretrained(model) else name  # never into the package
+    if path.is_file() and not _is_export(path):
+        raise ConfigError(f"{path} is no export of an agent and stays as it is; name another file with --output")
+    return path
+
+
+def _is_export(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError:
+        return False
+    return any(mark in head for mark in MARKS)
 
 
 def write_onnx(policy: ExportedPolicy, path: Path) -> None:
@@ -88,9 +114,8 @@ def command(argv: Sequence[str]) -> int:
         raise ConfigError(f"--format {args.format} writes a file that ends in {suffix}, got --output {args.output}")
     if args.format == "onnx":  # report it before the agent is loaded
         require("onnx", extra="export", what="--format onnx")
+    path = args.output or default_output(args.model, suffix)
     model = load_two_levels(args.model, trust=args.trust)
-    name = args.model.with_suffix(suffix)
-    path = args.output or (Path(name.name) if is_pretrained(args.model) else name)  # never into the package
     policy = extract(model, args.model.stem)
     if args.weights == "int8":
         policy = rounded(policy)

@@ -16,7 +16,7 @@ from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json, read_text, read_yaml
-from sb3_tbc.report.checked import check_final, check_place, check_sections, check_steps
+from sb3_tbc.report.checked import check_curve, check_final, check_place, check_sections
 from sb3_tbc.settings import merge
 from sb3_tbc.zoo.callbacks import EvaluationRow
 from sb3_tbc.zoo.config import OF_PAPER
@@ -179,7 +179,7 @@ def _load(folder: RunFolder) -> Run:
     for part in versions.get(RESUMED, []):
         check_sections({RESUMED: part}, RESUMED)
     rows = folder.read_evaluations()
-    check_steps([row.timesteps for row in rows])
+    check_curve(rows, final)
     return Run(final, rows, config, command, versions, folder.path)
 
 

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import multiprocessing
 import os
+import signal
 import sys
 import time
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 
@@ -197,14 +200,37 @@ def run_workers(job: Job, n: int, stop: StopRequest) -> int:
         return 0
     context = multiprocessing.get_context("spawn")
     workers = [context.Process(target=_main, args=(job, index), name=f"worker {index}") for index in range(n)]
-    for worker in workers:
-        worker.start()
+    with _ctrl_c_held_back():
+        for worker in workers:
+            worker.start()
     _watch(workers, stop)
     if stop:
         _stop(workers)
         raise KeyboardInterrupt
     codes = [worker.exitcode for worker in workers]
     return next((code for code in (0, USER_MISTAKE, INTERRUPTED) if code in codes), 1)
+
+
+@contextlib.contextmanager
+def _ctrl_c_held_back() -> Iterator[None]:
+    """Let processes that begin in the block hear Ctrl-C only when they ask for it, see :func:`_hear_ctrl_c`.
+
+    A terminal sends it to all processes; while they load their packages, it would end them in tracebacks.
+    """
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # beginning within the block, it would let the signal through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _hear_ctrl_c() -> None:
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _watch(workers: Sequence[BaseProcess], stop: StopRequest) -> None:
@@ -240,6 +266,7 @@ def _main(job: Job, index: int) -> None:
     th.set_num_threads(1)
     try:
         with stop_request() as stop:
+            _hear_ctrl_c()
             work(job, index, stop)
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)

@@ -74,6 +74,12 @@ def _parse_row(row: dict[str, str]) -> EvaluationRow:
     values = {name: float(text) for name, text in row.items()}
     if not 0.0 <= values["success_rate"] <= 1.0:
         raise ValueError(f"success_rate must lie in [0, 1], got {values['success_rate']}")
+    for name in ("timesteps", "episodes"):
+        if not values[name].is_integer():
+            raise ValueError(f"{name} must be a whole number, got {values[name]}")
+    for name in ("mean_length", "wall_time"):  # the other two are NaN where no window ended
+        if not 0.0 <= values[name] < math.inf:
+            raise ValueError(f"{name} must be a finite number of at least 0, got {values[name]}")
     steps, episodes = int(values.pop("timesteps")), int(values.pop("episodes"))
     return EvaluationRow(timesteps=steps, episodes=episodes, **values)
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_tbc.zoo.ledger import RunFolder, to_json
+from sb3_tbc.zoo.ledger import RunFolder, curve_summary, to_json
 
 
 def fake_run(
@@ -29,12 +29,14 @@ def fake_run(
     (folder.path / "versions.json").write_text(to_json(versions))
     lines = ["timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,wall_time"]
     rates = [rate * i / 4 for i in range(1, 5)] if curve is None else curve
-    lines += [f"{1000 * i},{y},10,10,0.5,4,{i}" for i, y in enumerate(rates, 1)]
+    lines += [f"{1000 * i},{y},10000,10,0.5,4,{i}" for i, y in enumerate(rates, 1)]
     folder.evaluations.write_text("\n".join(lines) + "\n")
     identity = {"task": task, "algo": algo, "variant": variant, "config": "tuned", "seed": seed, "success_rate": rate}
-    rest = {"mean_length_success": 10.0, "subgoal_success": 0.5, "mean_window": 4.0, "stable_share": 1.0}
-    counts = {"n_episodes": 100, "n_timesteps": 4000, "wall_time": 120.0, "eval_seed": 2_000_000 + 1000 * seed}
-    folder.finish({**identity, **counts, **rest, "worst_after_first_90": None, **final})
+    rest = {"mean_length_success": 10.0, "subgoal_success": 0.5, "mean_window": 4.0}
+    rest |= curve_summary(folder.read_evaluations())
+    counts = {"n_episodes": 100, "n_timesteps": max(4000, 1000 * len(rates)), "wall_time": 120.0}
+    counts["eval_seed"] = 2_000_000 + 1000 * seed
+    folder.finish({**identity, **counts, **rest, **final})
     return folder
 
 
@@ -45,12 +47,13 @@ def small_ledger(root: Path) -> None:
     slower = {"model": {"high": {"gradient_ratio": 0.5, "average_decay": 0.999}, "gradient_ratio": 2.0}}
     paper = {**equal, "model": {**levels, "target": "decision", "memory": None}}
     for seed, rate in enumerate((1.0, 0.97, 0.95), 100):
-        outcomes = "".join("0" if i % 33 == 0 and rate < 1 else "1" for i in range(100))
+        outcomes = "".join("0" if i % 20 == 0 and i < 2000 * (1 - rate) - 1 else "1" for i in range(100))
         quick = [0.5, 0.95, rate, rate]
         fake_run(root, "Pendulum", "tbc-hrl", seed, rate, config=equal, outcomes=outcomes, curve=quick)
-        fake_run(root, "Pendulum", "hits", seed, 0.9 * rate, config=equal, commit="0123abcd" + "+" * (seed == 101))
+        theirs, commit = round(0.9 * rate, 2), "0123abcd" + "+" * (seed == 101)
+        fake_run(root, "Pendulum", "hits", seed, theirs, config=equal, commit=commit)
         fake_run(root, "Pendulum", "tbc-hrl", seed, 0.5, variant="no-ndbc", config=equal, curve=[0.1, 0.5, 0.95, 0.5])
-        fake_run(root, "Drawbridge", "tbc-hrl", seed, 1.0, config=equal, stable_share=0.75, outcomes="1" * 100)
+        fake_run(root, "Drawbridge", "tbc-hrl", seed, 1.0, config=equal, curve=[1.0, 0.5, 1.0, 1.0], outcomes="1" * 100)
         fake_run(root, "Drawbridge", "hits", seed, 1.0, config=slower, curve=[1.0, 1.0, 1.0, 1.0])
         fake_run(root, "Platforms", "tbc-hrl", seed, 0.2, config=equal)
         fake_run(root, "Platforms", "hits", seed, 0.1, config=equal)

@@ -51,7 +51,7 @@ def row_of(root: Path, method: str) -> dict[str, str]:
 
 
 def test_final_success_is_the_last_evaluation_not_the_best(tmp_path: Path) -> None:
-    fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4, curve=[0.2, 1.0, 0.5, 0.4], best_success_rate=1.0)
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4, curve=[0.2, 1.0, 0.5, 0.4])
     assert row_of(tmp_path, "tbc-hrl")["success"] == "0.400"
 
 
@@ -88,7 +88,7 @@ def test_an_environment_s_id_names_its_folder(tmp_path: Path) -> None:
 
 def test_worst_is_the_lowest_of_all_seeds_not_their_mean(tmp_path: Path) -> None:
     for seed, lowest in enumerate((0.9, 0.2, 0.7)):
-        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, worst_after_first_90=lowest)
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, curve=[0.0, 1.0, lowest, 1.0])
     fake_run(tmp_path, "A", "hits", 0, 0.5)
     assert row_of(tmp_path, "tbc-hrl")["worst"] == "0.20"
     assert row_of(tmp_path, "hits")["worst"] == "-"
@@ -203,7 +203,7 @@ HEAD = "timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,
 @pytest.mark.parametrize(("uneven", "other"), [("tbc-hrl", "hits"), ("hits", "tbc-hrl")])
 def test_seeds_without_a_common_step_have_no_mean_curve(uneven: str, other: str, tmp_path: Path) -> None:
     for seed, steps in enumerate((1000, 5000)):  # one ends before the other is evaluated for the first time
-        folder = fake_run(tmp_path, "A", uneven, seed, 1.0, config={"eval_freq": steps})
+        folder = fake_run(tmp_path, "A", uneven, seed, 1.0, curve=[1.0] * 5, config={"eval_freq": steps})
         folder.evaluations.write_text(f"{HEAD}{steps},1,10,10,0.5,4,1\n")
     fake_run(tmp_path, "A", other, 0, 1.0)
     results = load_results(tmp_path)
@@ -211,14 +211,6 @@ def test_seeds_without_a_common_step_have_no_mean_curve(uneven: str, other: str,
     assert row.gain is None
     assert mean_curve(results["A"][uneven]) is None
     assert to_html(load_report(tmp_path), tmp_path / "report.html").count('<svg class="curves"') == 1
-
-
-@pytest.mark.parametrize(("steps", "told"), [((0, 5), "0 after 0"), ((5, 5), "5 after 5"), ((1, 9, 4), "4 after 9")])
-def test_a_curve_whose_steps_do_not_rise_is_refused(steps: tuple[int, ...], told: str, tmp_path: Path) -> None:
-    folder = fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
-    folder.evaluations.write_text(HEAD + "".join(f"{step},1,10,10,0.5,4,1\n" for step in steps))
-    with pytest.raises(ConfigError, match=f"seed_0: evaluations.csv must have steps above 0 that rise, got {told}"):
-        load_results(tmp_path)
 
 
 def test_comparisons_are_tested_over_seeds_and_corrected_together(tmp_path: Path) -> None:
@@ -248,9 +240,9 @@ def test_seeds_that_never_get_there_are_not_stable(tmp_path: Path) -> None:
     """A few seeds that learn do not beat a baseline that always does."""
     for seed in range(5):
         learns = seed < 2
-        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0 if learns else 0.3, stable_share=1.0 if learns else None)
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0 if learns else 0.3)
         for other in ("hits", "hac"):
-            fake_run(tmp_path, "A", other, seed, 0.95, stable_share=0.85 + seed / 500)
+            fake_run(tmp_path, "A", other, seed, 0.95, curve=[1.0] * (425 + seed) + [0.0] * (75 - seed))
     found = [claim for claim in claims(load_results(tmp_path)) if "stably" in claim.text]
     assert [claim.verdict for claim in found] == [SAME, SAME]
     assert ["against hac" in found[0].evidence, "against hits" in found[1].evidence] == [True, True]

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import optuna
 import pytest
@@ -17,6 +18,7 @@ from optuna.trial import TrialState
 from postgres import private_server
 
 from sb3_tbc.errors import TrainingError, WriteError
+from sb3_tbc.stopping import StopRequest
 from sb3_tbc.tune import worker
 from sb3_tbc.tune.study import COUNTED, ORIGIN, WORKER, count_done, open_storage
 
@@ -103,6 +105,43 @@ def test_a_workers_error_is_one_line(
 @pytest.mark.slow
 def test_a_killed_worker_on_a_journal(tmp_path: Path) -> None:
     check(*kill_one_worker_within_a_trial(tmp_path, str(tmp_path / "study.log")))
+
+
+JOB = worker.Job("study.log", NAME, Path(), 1, "random", "none", 0, "cpu", 60)
+
+
+def test_ctrl_c_does_not_reach_workers_that_load_their_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal sends it to all processes, and it ended each in a traceback of its imports."""
+    mask = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
+    held: list[bytes] = []
+
+    class Process:
+        exitcode = 0
+
+        def __init__(self, **_: object) -> None: ...
+
+        def start(self) -> None:
+            held.append(subprocess.check_output([sys.executable, "-c", mask]))
+
+        def is_alive(self) -> bool:
+            return False
+
+    monkeypatch.setattr(worker.multiprocessing, "get_context", lambda kind: SimpleNamespace(Process=Process))
+    assert worker.run_workers(JOB, 2, StopRequest()) == 0
+    assert held == [b"True\n", b"True\n"]
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+
+def test_a_worker_hears_the_ctrl_c_that_came_while_it_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    heard: list[bool] = []
+    monkeypatch.setattr(worker, "work", lambda job, index, stop: heard.append(bool(stop)))
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        os.kill(os.getpid(), signal.SIGINT)
+        worker._main(JOB, 0)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    assert heard == [True]
 
 
 @pytest.mark.slow
