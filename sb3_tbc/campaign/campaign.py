@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from sb3_tbc.campaign.executors import Executor, Handle
 from sb3_tbc.campaign.jobs import Job
@@ -114,12 +117,31 @@ class Campaign:
 
     def _stop(self) -> None:
         """Ask each run once to stop, and wait until all have saved a checkpoint."""
-        for handle in self.running.values():
-            handle.stop()
-        until = time.monotonic() + PATIENCE
-        while self.running and time.monotonic() < until:
-            for job, handle in list(self.running.items()):
-                if handle.poll() is not None:
-                    del self.running[job]
-                    self.board.stopped(job)
-            time.sleep(PAUSE)
+        with _signals_ignored():
+            self.board.stopping(len(self.running), PATIENCE)
+            for handle in self.running.values():
+                handle.stop()
+            until = time.monotonic() + PATIENCE
+            while self.running and time.monotonic() < until:
+                for job, handle in list(self.running.items()):
+                    if handle.poll() is not None:
+                        del self.running[job]
+                        self.board.stopped(job)
+                time.sleep(PAUSE)
+
+
+@contextlib.contextmanager
+def _signals_ignored() -> Iterator[None]:
+    """Let a second Ctrl-C change nothing: runs on a cluster would go on that were not asked yet, or end unsaved.
+
+    The commands that ask them, such as ``scancel``, do not hear it either.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -79,6 +79,12 @@ class Board:
         self._say(f"failed  {job.name}   (exit status {status}, see {job.log}) {message}".rstrip())
         self._close(job)
 
+    def stopping(self, count: int, seconds: float) -> None:
+        """Runs were asked to stop; said at once, as nothing else is seen until they have saved themselves."""
+        if count:
+            runs = "1 run saves itself" if count == 1 else f"{count} runs save themselves"
+            self._say(f"stopping: {runs}, in at most {seconds:.0f} seconds")
+
     def stopped(self, job: Job) -> None:
         """A run was asked to stop and can be continued."""
         self._say(f"stopped {job.name}")

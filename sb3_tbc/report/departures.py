@@ -6,7 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from sb3_tbc.aliases import PlainMapping
+from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.errors import ConfigError
+from sb3_tbc.outside import one_line
 from sb3_tbc.report.comparisons import common_threshold, convergence_gain, difference_of
 from sb3_tbc.report.conditions import differences
 from sb3_tbc.report.runs import OURS, Results, Run, read_table
@@ -51,7 +53,7 @@ def departures(root: Path, results: Results) -> list[Departure]:
     :param root: folder of the results, for the table of what each row measures
     :raises ConfigError: if that table cannot be read
     """
-    table = read_table(root / MEASUREMENTS)
+    table = _measured_settings(root / MEASUREMENTS)
     tasks: dict[tuple[str, str, str], list[str]] = {}
     for task in results:
         for setting, (paper, shipped) in departures_of(task).items():
@@ -61,6 +63,18 @@ def departures(root: Path, results: Results) -> list[Departure]:
         measured = [said for task in names for said in _measurements(setting, task, table, results)]
         found.append(Departure(setting, paper, shipped, tuple(names), tuple(measured)))
     return found
+
+
+def _measured_settings(path: Path) -> dict[str, Plain]:
+    """The table of what each row measures; in a text, which is no list, any part of a setting's name would be found."""
+    table = read_table(path)
+    for task, rows in table.items():
+        for row, settings in rows.items():
+            if not isinstance(settings, list):
+                raise ConfigError(
+                    f"{path}: {task}, {row} must be a list of settings, as [gamma], got {one_line(repr(settings))}"
+                )
+    return table
 
 
 def _measurements(setting: str, task: str, table: Mapping[str, PlainMapping], results: Results) -> list[str]:

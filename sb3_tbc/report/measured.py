@@ -19,7 +19,8 @@ def measured_yaml(results: Results) -> str:
     """
     tasks = {}
     for task, methods in results.items():
-        runs = [run.final for run in methods.get(OURS, []) if run.final.get("wall_time")]
+        finals = [run.final for run in methods.get(OURS, [])]
+        runs = [final for final in finals if final.get("wall_time") and final.get("n_timesteps")]
         if runs:
             counts = Counter(int(run["n_timesteps"]) for run in runs)
             steps = max(counts, key=lambda steps: (counts[steps], steps))

@@ -176,7 +176,10 @@ def _load(folder: RunFolder) -> Run:
         raise ValueError(f"{VERSIONS} must hold named values, got {type(versions).__name__}")
     check_sections(config, "model", "env_kwargs", "model.high", "model.low")
     check_sections(versions, "packages")
-    for part in versions.get(RESUMED, []):
+    later = versions.get(RESUMED, [])
+    if not isinstance(later, list):
+        raise ConfigError(f"{VERSIONS}: {RESUMED} must be a list, got {type(later).__name__}")
+    for part in later:
         check_sections({RESUMED: part}, RESUMED)
     rows = folder.read_evaluations()
     check_curve(rows, final)
@@ -239,7 +242,8 @@ def read_table(path: Path) -> dict[str, Plain]:
     if not path.is_file():
         return {}
     try:
-        return {str(task): {str(k): v for k, v in lines.items()} for task, lines in read_yaml(path).items()}
+        table = read_yaml(path) or {}  # of comments alone
+        return {str(task): {str(k): v for k, v in lines.items()} for task, lines in table.items()}
     except AttributeError as error:
         raise ConfigError(f"{path} must hold two levels of names: {one_line(error)}") from error
 

@@ -71,6 +71,9 @@ def read_evaluations(path: Path) -> list[EvaluationRow]:
 
 
 def _parse_row(row: dict[str, str]) -> EvaluationRow:
+    # the csv module gives a line that is too long a further key, and one that was cut off values of None
+    if len(row) > len(EvaluationRow._fields) or any(text is None for text in row.values()):
+        raise ValueError("it has not as many values as there are columns")
     values = {name: float(text) for name, text in row.items()}
     if not 0.0 <= values["success_rate"] <= 1.0:
         raise ValueError(f"success_rate must lie in [0, 1], got {values['success_rate']}")

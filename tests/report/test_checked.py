@@ -9,7 +9,7 @@ import pytest
 from made_up_runs import fake_run
 
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.report.runs import load_results
+from sb3_tbc.report.runs import DESCRIPTIONS, TUNING_SEEDS, load_descriptions, load_results
 from sb3_tbc.zoo.ledger import to_json
 
 HEAD = "timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,wall_time\n"
@@ -29,6 +29,8 @@ def test_a_curve_whose_steps_do_not_rise_is_refused(steps: tuple[int, ...], told
         ("4000,0.55,10,10,0.5,4,4", "evaluations.csv, step 4000: success_rate is 0.55, which is no share of 10 ep"),
         ("4000,1,0,10,0.5,4,4", "evaluations.csv must have episodes above 0, got 0 at step 4000"),
         ("4001,1,10,10,0.5,4,4", "evaluations.csv ends at step 4001, but final.json is of 4000 steps"),
+        ("4000,1,10,10,0.5", "it has not as many values as there are columns"),
+        ("4000,1,10,10,0.5,4,4,4", "it has not as many values as there are columns"),
         ("3000.5,1,10,10,0.5,4,4", "timesteps must be a whole number, got 3000.5"),
         ("4000,1,10,nan,0.5,4,4", "mean_length must be a finite number of at least 0, got nan"),
         ("4000,1,10,10,0.5,4,-1", "wall_time must be a finite number of at least 0, got -1.0"),
@@ -57,3 +59,17 @@ def test_a_result_that_contradicts_itself_is_refused(final: dict[str, object], t
     (folder.path / "final.json").write_text(to_json({**folder.read_final(), **final}))
     with pytest.raises(ConfigError, match=f"seed_0: {re.escape(told)}: one of them was changed"):
         load_results(tmp_path)
+
+
+def test_versions_of_later_parts_that_are_no_list(tmp_path: Path) -> None:
+    (fake_run(tmp_path, "A", "tbc-hrl", 0, 0.9).path / "versions.json").write_text('{"resumed": 5}')
+    with pytest.raises(ConfigError, match=r"seed_0: versions\.json: resumed must be a list, got int"):
+        load_results(tmp_path)
+
+
+def test_tables_of_comments_alone_are_empty(tmp_path: Path) -> None:
+    fake_run(tmp_path, "A", "tbc-hrl", 0, 0.9)
+    for name in (DESCRIPTIONS, TUNING_SEEDS):
+        (tmp_path / name).write_text("# A: {tbc-hrl: ...}\n")
+    assert list(load_results(tmp_path)) == ["A"]
+    assert load_descriptions(tmp_path) == {}

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import yaml
 from made_up_runs import fake_run
 
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.report.departures import departures_of, departures_table
 from sb3_tbc.report.runs import load_results
 
@@ -31,6 +33,17 @@ def test_departures_from_the_paper_come_with_their_measurement(tmp_path: Path) -
     assert cells["max_options", "UR5Reacher"]["paper"] == "24"
     assert not [row for row in rows if row[1] == row[2]]
     assert not [row for row in rows if row[0] == "kappa"]  # the same in both
+
+
+@pytest.mark.parametrize("settings", ["memory_of_old", "5", ""])
+def test_measured_settings_are_a_list(settings: str, tmp_path: Path) -> None:
+    """In the text, ``memory`` was found, and the row counted as its measurement; a number ended in a traceback."""
+    fake_run(tmp_path, "Pendulum", "tbc-hrl", 0, 0.9)
+    (tmp_path / "measurements.yml").write_text(f"default: {{tbc-hrl with-memory: {settings}}}")
+    with pytest.raises(
+        ConfigError, match=r"default, tbc-hrl with-memory must be a list of settings, as \[gamma\], got"
+    ):
+        departures_table(tmp_path, load_results(tmp_path))
 
 
 def test_measurements_name_departures_that_there_are() -> None:

@@ -237,6 +237,7 @@ def test_minutes_are_those_of_runs_of_equal_length(tmp_path: Path) -> None:
     for seed, (steps, seconds) in enumerate(((4000, 60.0), (9000, 6000.0), (4000, 120.0), (1000, 1.0))):
         fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, curve=[1.0], n_timesteps=steps, wall_time=seconds)
         fake_run(tmp_path, "B", "tbc-hrl", seed, 1.0, curve=[1.0], n_timesteps=steps + seed, wall_time=seconds)
+    fake_run(tmp_path, "C", "tbc-hrl", 0, 1.0, n_timesteps=None)  # a result that does not say how long it took
     measured = yaml.safe_load(measured_yaml(load_results(tmp_path)))["tasks"]
     assert measured == {
         "A": {"steps": 4000, "minutes": 1.5, "seeds": 2},
