@@ -35,6 +35,8 @@ from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise
 from sb3_tbc.zoo.rows import RowsCallback
 from sb3_tbc.zoo.safety import CURE, ConsistentState, DivergenceCallback, check_weights
 
+TRAINED = "wall_time"
+"""In an agent's run information: seconds that its training took, evaluations included."""
 HELD_OUT = 50_000_000
 """First seed of episodes that no run has met, neither in training nor in its evaluations."""
 
@@ -235,8 +237,11 @@ def _only_evaluate(spec: RunSpec, folder: RunFolder, options: RunOptions) -> Pla
         model = load_model(folder.model, env, options.device, options.trust)
     finally:
         env.close()
-    rows = folder.read_evaluations()
-    return finish(model, spec, folder, options, rows[-1].wall_time if rows else 0.0)
+    rows, info = folder.read_evaluations(), getattr(model, RUN_INFO, None)
+    trained = info.get(TRAINED) if isinstance(info, dict) else None
+    if not isinstance(trained, float):  # of an earlier version: what came after the last evaluation is not known
+        trained = rows[-1].wall_time if rows else 0.0
+    return finish(model, spec, folder, options, trained)
 
 
 def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions, command: str) -> Plain:
@@ -315,8 +320,10 @@ class Training:
         check_weights(model)
         if self.options.keep_checkpoint:
             self.checkpoint()
+        trained = self.evaluations.wall_time
+        setattr(model, RUN_INFO, {**spec.identity, TRAINED: trained})  # for its result, if that is made later
         save_atomic(model.save, self.folder.model)
-        return finish(model, spec, self.folder, self.options, self.evaluations.wall_time)
+        return finish(model, spec, self.folder, self.options, trained)
 
     def checkpoint(self, save_replay: Callable[[Path], object] | None = None) -> None:
         """Save everything that is needed to resume the run."""
@@ -434,5 +441,5 @@ def _final(model: Agent, spec: RunSpec, folder: RunFolder, stop: StopRequest, tr
         "eval_seed": seed,
         **curve_summary(folder.read_evaluations()),
         "wall_time": round(trained, 1),
-        "steps_per_second": round(model.num_timesteps / max(trained, 1e-9), 1),
+        "steps_per_second": round(model.num_timesteps / trained, 1) if trained else None,
     }
