@@ -150,7 +150,8 @@ class SlurmHandle:
 
     def stop(self) -> None:
         """Cancel the job; Slurm asks the run to end first."""
-        self.job.cancel()
+        with contextlib.suppress(Exception):  # scancel fails for a job that has just ended, and others must be asked
+            self.job.cancel()
 
 
 class SlurmExecutor:
