@@ -104,13 +104,14 @@ def _high(g: _Graph, policy: ExportedPolicy) -> tuple[str, str]:
     parts = ["desired_goal", "observation"] + ([] if policy.achieved_in_observation else ["achieved_goal"])
     seen = g.cast(g.join(*parts), TensorProto.DOUBLE)
     unit = _squash(g, _mlp(g, policy.high, seen), policy.mean_bounds[0])
+    # Term by term as the agent does it: rounded otherwise, a whole time budget could lie just above, a step longer.
+    share = g("Mul", g("Add", unit, g.constant(1.0, np.float64)), g.constant(0.5, np.float64))
     d = policy.subgoal_dim
-    half = 0.5 * (policy.subgoal_high - policy.subgoal_low)
-    subgoal = g.affine(g.slice(unit, 0, d), half, policy.subgoal_low + half, np.float64)
+    width = policy.subgoal_high - policy.subgoal_low
+    subgoal = g.affine(g.slice(share, 0, d), width, policy.subgoal_low, np.float64)
     if policy.fixed_budget is not None:
         return subgoal, g.constant([[policy.fixed_budget]], np.float64)
-    span = 0.5 * (policy.dt_max - policy.dt_min)
-    budget = g.affine(g.slice(unit, d, d + 1), span, policy.dt_min + span, np.float64)
+    budget = g.affine(g.slice(share, d, d + 1), policy.dt_max - policy.dt_min, policy.dt_min, np.float64)
     if policy.whole_budgets:
         budget = g("Max", g("Round", budget), g.constant([[1.0]], np.float64))
     return subgoal, budget
