@@ -25,7 +25,7 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
     """SB3's hindsight replay for tasks that end on success: a relabelled transition that meets its goal is terminal.
 
     So is one that ended its episode in failure, as a fall does. SB3 keeps the flag that was stored, under which the
-    value of standing on a relabelled goal never stops to grow.
+    value of standing on a relabelled goal never stops to grow. A transition that keeps its goal keeps its reward, too.
 
     :param event_goals: take the goal from the step of the task's event (:attr:`SubgoalSpace.event`) for all transitions
         of an episode in which it happened, and leave those of the others as they are
@@ -62,12 +62,15 @@ class TerminatingHerReplayBuffer(HerReplayBuffer):
         reached = samples.next_observations["achieved_goal"].cpu().numpy()
         wanted = samples.observations["desired_goal"].cpu().numpy()
         ended = np.flatnonzero(samples.dones.cpu().numpy())
-        first = self.observations["desired_goal"][batch_indices, env_indices][ended]
-        pairs = np.concatenate([reached, reached[ended]]), np.concatenate([wanted, first])
+        given = self.observations["desired_goal"][batch_indices, env_indices]
+        pairs = np.concatenate([reached, reached[ended]]), np.concatenate([wanted, given[ended]])
         met, met_first = np.split(goal_test_of(self.env).terminated(*pairs), [len(reached)])
         met[ended] |= ~met_first  # a failure ends with any goal
         dones = met.astype(np.float32)
-        return samples._replace(dones=th.from_numpy(dones).reshape(-1, 1).to(self.device))
+        same = np.flatnonzero((wanted == given).all(axis=1))  # the task's own reward may pay for more than the goal
+        rewards = samples.rewards.clone()
+        rewards[same] = self.to_torch(self.rewards[batch_indices[same], env_indices[same]].reshape(-1, 1))
+        return samples._replace(dones=th.from_numpy(dones).reshape(-1, 1).to(self.device), rewards=rewards)
 
     def add(
         self,

@@ -114,6 +114,28 @@ def test_flat_hindsight_takes_its_goals_from_the_event() -> None:
     assert len(set(goals) & set(events)) >= 2  # of several episodes
 
 
+class Precipice(Bell):
+    """The corridor ends in a fall, which costs 7."""
+
+    def step(self, action: Any) -> Any:
+        observation, reward, terminated, truncated, info = super().step(action)
+        fell = self.steps == 9
+        return observation, -7.0 if fell else reward, terminated or fell, truncated, info
+
+
+def test_flat_samples_that_keep_their_goal_keep_their_reward() -> None:
+    """No bell has rung before the fall: one step and goal had two rewards, -7 as stored and -1 where it was sampled."""
+    model = FlatSAC(
+        "MultiInputPolicy", Precipice(), gradient_ratio=0.0, n_hindsight_goals=3, goal_strategy="event",
+        buffer_size=200, policy_kwargs={"net_arch": [8]}, seed=0,
+    ).learn(90)  # fmt: skip
+    samples = model.replay_buffer.sample(400)
+    fell = samples.next_observations["observation"][:, 1] == 9
+    assert fell.any()
+    assert (samples.rewards[fell] == -7).all()
+    assert (samples.rewards[~fell] == -1).all()
+
+
 def test_tennis_has_one_event_in_an_episode() -> None:
     pytest.importorskip("Box2D")
     env = gym.make("sb3_tbc/Tennis2D-v0", observation="compact")
