@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import io
 import pathlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -12,7 +13,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.save_util import recursive_getattr, recursive_setattr
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, TensorDict
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError, nearest
@@ -71,6 +72,13 @@ class PlainAlgorithm(BaseAlgorithm):
         target = pathlib.Path(path)
         target = target if target.suffix else target.with_suffix(".zip")
         save_atomic(lambda name: pathlib.Path(name).write_bytes(content), target)
+
+    def set_parameters(
+        self, load_path_or_dict: str | TensorDict, exact_match: bool = True, device: th.device | str = "auto"
+    ) -> None:
+        """Take over copies of parameters, see SB3."""
+        # torch's optimizers keep the very moments that they are given: two agents would go on to share them
+        super().set_parameters(copy.deepcopy(load_path_or_dict), exact_match, device)
 
     def _setup_learn(
         self,

@@ -240,13 +240,24 @@ def test_replay_is_kept(algo: str, tmp_path: Path) -> None:
     assert loaded._n_updates > model._n_updates
 
 
+def _flat(parameters: Any) -> Any:
+    """Parameters as plain numbers, which can be compared."""
+    if isinstance(parameters, dict):
+        return {name: _flat(value) for name, value in parameters.items()}
+    return parameters.tolist() if hasattr(parameters, "tolist") else parameters
+
+
 @shows("yes", "get_parameters", "set_parameters")
 @every_algorithm
 def test_parameters_travel(algo: str) -> None:
     taught, fresh = make(algo).learn(100), make(algo, seed=3)
     parameters = copy.deepcopy(taught.get_parameters())
-    fresh.set_parameters(parameters)
+    fresh.set_parameters(taught.get_parameters())
     np.testing.assert_array_equal(act(fresh), act(taught))
+    fresh.learn(200)
+    assert fresh._n_updates
+    assert _flat(taught.get_parameters()) == _flat(parameters)  # the optimizers' moments, too
+    fresh.set_parameters(parameters)
     with pytest.raises(ValueError, match="nonsense"):
         fresh.set_parameters({**parameters, "nonsense": {}})
     with pytest.raises(ValueError, match="parameters"):
