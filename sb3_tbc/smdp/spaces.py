@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from sb3_tbc.aliases import Plain, Space
 from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
+from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 
 GoalObservation = Mapping[str, AnyArray]
 """A goal environment's observation: ``observation``, ``achieved_goal``, ``desired_goal``, single or batched."""
@@ -241,8 +242,14 @@ class SubgoalSpace:
 
     def _shape_from(self, name: str, space: spaces.Dict, *batch: int) -> tuple[int, ...]:
         """Shape of what a map gives of an observation, or of a batch of them."""
-        blank = {key: np.zeros((*batch, *(part.shape or ()))) for key, part in space.spaces.items()}
-        return np.shape(getattr(self, name)(blank))
+        blank = {key: np.zeros((*batch, *(space[key].shape or ()))) for key in GOAL_KEYS}  # no other part is kept
+        try:
+            return np.shape(getattr(self, name)(blank))
+        except KeyError as error:
+            raise ValueError(
+                f"the subgoal space's {name} map reads the part {error} of an observation, but agents of two levels "
+                f"see {', '.join(GOAL_KEYS)} alone: put its entries into 'observation'"
+            ) from error
 
     def achieved(self, observation: GoalObservation) -> FloatArray:
         """Subgoal-space point of a goal observation, ``(..., subgoal_dim)``, task units."""

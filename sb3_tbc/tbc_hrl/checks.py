@@ -13,7 +13,7 @@ from gymnasium import spaces
 from numpy.typing import ArrayLike
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 
-from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.aliases import Plain, PlainMapping, Space
 from sb3_tbc.arrays import Arrays, BoolArray
 from sb3_tbc.settings import SettingError, hints
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, width
@@ -88,6 +88,20 @@ def refuse_vec_normalize(env: VecEnv) -> None:
         raise ValueError(
             "VecNormalize moves the subgoal space, and the units of goals, while the agent learns; use the task's "
             "fixed scales instead"
+        )
+
+
+def warn_of_unseen(space: Space) -> None:
+    """Name the parts of an observation that SB3's policies would see, and an agent of two levels does not.
+
+    :param space: of an environment's observations
+    """
+    unseen = sorted(set(getattr(space, "spaces", ())) - set(GOAL_KEYS))
+    if unseen:
+        warnings.warn(
+            f"the agent does not see {', '.join(map(repr, unseen))} of an observation, only {', '.join(GOAL_KEYS)}: "
+            "put what it should know into 'observation'; FilterObservation leaves parts out without this warning",
+            stacklevel=2,
         )
 
 

@@ -227,6 +227,7 @@ class TBCHRL(TwoLevelSaving):
     def _read_environment(self, env: VecEnv) -> None:
         """What the task itself says: subgoals and episode length."""
         checks.refuse_vec_normalize(env)
+        checks.warn_of_unseen(env.observation_space)
         check_goal_test(env)
         if self.subgoals is None:
             self.subgoals = attribute_of(env, "subgoals")

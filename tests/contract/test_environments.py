@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -212,6 +212,31 @@ def test_what_is_no_goal_environment(algo: str) -> None:
     for env, words in refused:
         with pytest.raises((ValueError, AssertionError), match=words):
             make(algo, env)
+
+
+class AlsoLight(gym.ObservationWrapper):  # type: ignore[type-arg]
+    """Adds a part to a goal observation."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        super().__init__(env)
+        parts = cast(spaces.Dict, env.observation_space).spaces
+        self.observation_space = spaces.Dict({**parts, "light": spaces.Box(0, 1, (2,), np.float64)})
+
+    def observation(self, observation: Any) -> Any:
+        return {**observation, "light": np.zeros(2)}
+
+
+@shows("yes", "further parts of an observation")
+@two_levels
+def test_what_two_levels_do_not_see_is_told(algo: str) -> None:
+    with pytest.warns(UserWarning, match="does not see 'light' of an observation"):
+        assert make(algo, AlsoLight(corridor())).learn(30).num_timesteps == 30
+    space = SubgoalSpace([-1.0], [1.0], [0.05], lambda o: o["achieved_goal"], lambda o: o["light"], [1.0, 1.0], ["x"])
+    with (
+        pytest.warns(UserWarning, match="does not see 'light'"),
+        pytest.raises(ValueError, match=r"local map reads the part 'light' .* put its entries into 'observation'"),
+    ):
+        make(algo, AlsoLight(Corridor(20)), subgoals=space)
 
 
 @shows("refused", "observations and rewards that are NaN")
