@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -237,3 +239,12 @@ def test_sb3s_algorithms_learn_the_low_levels_problem() -> None:
             kinds.add(cut)
             assert cut == (last[-1] > 0)  # time was left when it was cut off
     assert kinds == {True, False}
+
+
+def test_the_pages_example_of_a_low_level_runs() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "your_task.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page.partition("## Another algorithm as the low level\n")[2], re.DOTALL)
+    found: dict[str, Any] = {}
+    exec(code.replace("learn(50_000)", "learn(128)"), found)
+    assert found["low"].num_timesteps == 128
+    assert found["low"].observation_space == found["venv"].observation_space
