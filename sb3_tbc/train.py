@@ -189,13 +189,15 @@ def variant_name(run: RunConfig, ablation: str | None, config: str | None) -> st
 def describe(result: Plain, folder: RunFolder) -> str:
     """What to print at the end: the result, where everything lies, and how to evaluate it."""
     low, high = result["success_ci95"]
+    env_id = RunSpec.from_dict(folder.read_config()).env_id
+    module = ["--env", env_id] if ":" in env_id else []  # no file is trusted to name what is imported
     lines = [
         f"success rate   {result['success_rate']:.2f}  (95 % Wilson interval {low:.2f} to {high:.2f}, "
         f"{result['n_episodes']} episodes, after {result['n_timesteps']:,} steps in {result['wall_time']:.0f} s)",
         f"agent          {folder.model}",
         f"best agent     {folder.best_model}" if folder.best_model.is_file() else "best agent     (not evaluated)",
         f"learning curve {folder.evaluations}",
-        f"evaluate       {python()} -m sb3_tbc.evaluate {shlex.quote(str(folder.model))}",
+        f"evaluate       {python()} -m sb3_tbc.evaluate {shlex.join([str(folder.model), *module])}",
     ]
     return "\n".join(lines)
 

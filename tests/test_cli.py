@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime
 import json
+import shlex
 import shutil
 import signal
 import subprocess
@@ -41,6 +42,19 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def run(root: Path) -> RunFolder:
     return RunFolder.for_run(root, "Pendulum", "tbc-hrl", "custom", 5)
+
+
+def test_the_evaluation_that_is_printed_works_for_a_task_of_ones_own(
+    tmp_path: Path, monkeypatch: Any, capsys: Any
+) -> None:
+    register = "gymnasium.register('Own-v0', corridor.Corridor, max_episode_steps=20)"
+    (tmp_path / "own_tasks.py").write_text(f"import corridor, gymnasium\n{register}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    arguments = ["--env", "own_tasks:Own-v0", "--n-timesteps", "100", "--log-folder", str(tmp_path)]
+    assert train.main([*arguments, *SHORT, *TINY]) == 0
+    printed = shlex.split(capsys.readouterr().out.splitlines()[-1].partition("sb3_tbc.evaluate ")[2])
+    del sys.modules["own_tasks"]
+    assert evaluate.main([*printed, "--n-episodes", "1"]) == 0
 
 
 def test_a_run_leaves_everything_behind(run: RunFolder) -> None:

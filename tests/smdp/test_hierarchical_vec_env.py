@@ -243,7 +243,9 @@ def test_sb3s_algorithms_learn_the_low_levels_problem() -> None:
 
 def test_the_pages_example_of_a_low_level_runs() -> None:
     page = (Path(__file__).parents[2] / "docs" / "your_task.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"```python\n(.*?)```", page.partition("## Another algorithm as the low level\n")[2], re.DOTALL)
+    (code,) = re.findall(
+        r"```python\n(.*?)```", page.partition("## Another algorithm as the low level\n")[2], re.DOTALL
+    )
     found: dict[str, Any] = {}
     exec(code.replace("learn(50_000)", "learn(128)"), found)
     assert found["low"].num_timesteps == 128
