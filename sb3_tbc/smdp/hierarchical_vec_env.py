@@ -247,7 +247,8 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
             if not self.clock.elapsed[index]:  # its first step was bad
                 continue
             step = int(self._recorder.steps[index])
-            option = self.clock.close(index, step, bool(reached[row]), bool(dones[index]))
+            cut_off = bool(dones[index]) and not _used_up(infos[index])
+            option = self.clock.close(index, step, bool(reached[row]), cut_off)
             self._recorder.options[index].append(option)
             infos[index]["option"] = option.as_info()
             rewards[row] = float(option.reached)
@@ -266,10 +267,9 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
         return episodes
 
     def _finish_episode(self, index: int, info: Plain) -> Episode:
-        truncated = info.get("TimeLimit.truncated", False)
-        exhausted = truncated and info.get(BUDGET_EXHAUSTED, False)  # a wrapper may end it with success in that step
+        truncated, exhausted = info.get("TimeLimit.truncated", False), _used_up(info)
         success = info["is_success"] = self.judge.succeeded(info)
-        return self._recorder.finish(index, not truncated, success and not exhausted, bool(exhausted))
+        return self._recorder.finish(index, not truncated, success and not exhausted, exhausted)
 
     def _begin_episodes(self, where: Indices, observation: GoalObservation) -> None:
         self.clock.begin_episode(where)
@@ -286,6 +286,11 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
 
     def _low_observation(self, observation: GoalObservation) -> FloatArray:
         return self.views.low(observation, self.clock.subgoal, self.clock.remaining)
+
+
+def _used_up(info: Plain) -> bool:
+    """Whether the episode ended with the last window that it may have; a wrapper may end it with success in that step."""
+    return bool(info.get("TimeLimit.truncated", False) and info.get(BUDGET_EXHAUSTED, False))
 
 
 CUT_OFF = tuple(

@@ -18,7 +18,8 @@ class TerminationReason(enum.Enum):
     """What ended an option; stored by name. Whether its subgoal was reached is another question.
 
     ``REACHED`` is an end *before* the time budget, because the subgoal was reached; ``EXPIRED`` the end of the budget,
-    reached or not; ``EPISODE_END`` and ``EVENT`` cut an option off; ``RECONSIDERED`` is cut off by the high level.
+    reached or not; ``EPISODE_END`` and ``EVENT`` cut an option off; ``RECONSIDERED`` is cut off by the high level. The
+    last option that an episode may have ends the episode, and keeps the reason of its own end.
     """
 
     REACHED = "reached"
@@ -256,22 +257,22 @@ class OptionClock:
         """Whose subgoal is reached, among the environments ``where``; ``seen`` has one row for each of them."""
         return self.subgoals.reached(self.subgoals.achieved(seen), self.subgoal[where])
 
-    def close(self, index: int, step: int, reached: bool, episode_over: bool) -> Option:
+    def close(self, index: int, step: int, reached: bool, cut_off: bool) -> Option:
         """The option of environment ``index`` as a record.
 
         An option that was cut off had no chance to reach its subgoal: it counts as not reached.
 
         :param step: the number of steps of its episode so far
         :param reached: whether its subgoal is reached now
-        :param episode_over: whether the episode ends with this step; if not, and the window is not at an end of its
-            own, the high level gave it up or the task's event ended it
+        :param cut_off: whether the episode ends with this step, and not because this was the last window it may have;
+            if not, and the window is not at an end of its own, the high level gave it up or the task's event ended it
         """
         expired, early = self.expired[index], self.may_end[index]
         if expired:
             reason = TerminationReason.EXPIRED
         elif self.rules.completed(expired, np.asarray(reached), early):
             reason = TerminationReason.REACHED
-        elif episode_over:
+        elif cut_off:
             reason = TerminationReason.EPISODE_END
         else:
             reason = TerminationReason.RECONSIDERED if self._given_up[index] else TerminationReason.EVENT

@@ -13,7 +13,14 @@ from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import AnyArray, FloatArray, Indices
 from sb3_tbc.errors import EnvironmentFault, NonFiniteError
 from sb3_tbc.smdp.copyable import CopyableVecEnvWrapper
-from sb3_tbc.smdp.episode_limit import with_episode_limit
+from sb3_tbc.smdp.episode_limit import (
+    BUDGET_EXHAUSTED,
+    LastWindow,
+    LimitingVecEnv,
+    announce,
+    can_tell,
+    with_episode_limit,
+)
 from sb3_tbc.smdp.faults import reset_or_name
 from sb3_tbc.smdp.finite import not_finite
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, rows_of
@@ -71,7 +78,7 @@ class OptionEnv(CopyableVecEnvWrapper):
         self.agent, self.policy, self.deterministic = agent, policy, deterministic
         self.rng = np.random.default_rng(seed)
         self.clock = OptionClock(venv.num_envs, policy.views.subgoals, policy.rules)
-        self._last_windows = LastWindows(self.venv, self.clock, task_can_tell=True)
+        self._last_windows = LastWindows(self.venv, self.clock, can_tell(self.venv))
         self._membrane = policy.actor.blank(venv.num_envs)
         self._shapes = shapes_of(venv.observation_space)  # env_method brings what worker processes have not checked
         self._seen: dict[str, FloatArray] = {}
@@ -165,14 +172,29 @@ class OptionEnv(CopyableVecEnvWrapper):
         reward, duration = self.agent.high_reward, np.array([len(rewards)])
         where = np.array([index])
         reached = bool(self.clock.reached(rows_of(self._seen, where), where)[0])
-        info["option"] = self.clock.close(index, int(duration[0]), reached, over).as_info()
+        cut_off = over and not (info["TimeLimit.truncated"] and info.get(BUDGET_EXHAUSTED, False))
+        info["option"] = self.clock.close(index, int(duration[0]), reached, cut_off).as_info()
         info["discount"] = float(reward.discounts(duration)[0])
         value = reward.window_rewards(np.array(rewards), np.array([0]), duration)[0]
         value -= reward.price(self.clock.time_budget[index])
         if over or self.clock.is_last[index]:
             info["TimeLimit.truncated"] = bool(info["TimeLimit.truncated"] or not over)
+            if not over:
+                self._end_late(index, info)
             self._restart(index, info)
         return float(value)
+
+    def _end_late(self, index: int, info: Plain) -> None:
+        """End an episode whose last window's end the task did not see, by a step that does not count.
+
+        So a ``Monitor`` sees the end. Environments without wrappers have none that would.
+        """
+        if isinstance(self.venv, LimitingVecEnv):
+            return
+        announce(self.venv, index, LastWindow(True))
+        action = self._act(np.array([index]))[0]
+        told = self.venv.env_method("step", action, indices=[index])[0][-1]
+        info |= {key: told[key] for key in ("episode",) if key in told}
 
     def _restart(self, index: int, info: Plain) -> None:
         where = np.array([index])

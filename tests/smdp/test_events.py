@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from corridor import Corridor, achieved, local
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_tbc import HAC, TBCHRL
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
@@ -15,6 +16,7 @@ from sb3_tbc.smdp.hindsight import check_goal_strategy, goal_pairs
 from sb3_tbc.smdp.options import TerminationReason
 from sb3_tbc.smdp.spaces import SubgoalSpace
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
+from sb3_tbc.tbc_hrl.option_env import OptionEnv
 
 LEVEL: dict[str, Any] = {"batch_size": 16, "policy_kwargs": {"net_arch": [8, 8]}}
 FLAG, EVENT = 3, 17
@@ -58,6 +60,22 @@ def test_an_event_ends_every_option(window_end: str) -> None:
             reasons += [option.reason for option in episode.options if option is not cut]
             reasons.append(cut.reason)
     assert TerminationReason.EVENT in reasons
+
+
+def test_an_event_that_ends_the_last_option_is_told_as_the_event() -> None:
+    """The option was not cut off by the episode's end: its end was the episode's."""
+    model = make(Bell(), max_options=1, dt_max=40.0, dt_min=30.0)
+    model.learn(100)
+    told = []
+    for episode in (e for _ in range(60) for e in model.collector.step().episodes.values()):
+        assert episode.budget_exhausted
+        told += [(option.reason, option.duration) for option in episode.options]
+    assert set(told) == {(TerminationReason.EVENT, EVENT)}
+    env = OptionEnv(DummyVecEnv([Bell]), model)
+    env.reset()
+    _, _, dones, infos = env.step(np.array([[0.0, 1.0]]))
+    assert dones[0]
+    assert (infos[0]["option"]["reason"], infos[0]["option"]["duration"]) == ("event", EVENT)
 
 
 def test_predict_begins_a_new_option_at_an_event_too() -> None:

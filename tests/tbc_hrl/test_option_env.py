@@ -81,6 +81,30 @@ def test_episodes_end_as_the_agents_do_and_monitors_see_it(agent: TBCHRL) -> Non
     assert [len(each) for each in episodes] == [3, 3]
 
 
+class Shifted(gym.ObservationWrapper[Any, Any, Any]):
+    """Shows every position 0.3 to the right of where the task has it; the spaces stay."""
+
+    def observation(self, observation: Any) -> Any:
+        return {key: part + 0.3 * (np.arange(len(part)) == 0) for key, part in observation.items()}
+
+
+def test_last_windows_end_by_what_the_agent_sees_not_the_task_beneath_a_wrapper() -> None:
+    made = make_vec_env(lambda: Corridor(goal=5.0), 1, wrapper_class=Shifted, seed=0)
+    agent = TBCHRL("MultiInputPolicy", made, max_options=1, dt_max=40.0, window_end="reached", compile=False, seed=0)
+    venv = make_vec_env(lambda: Corridor(goal=5.0), 1, wrapper_class=Shifted, seed=0)
+    env, rng, durations = OptionEnv(venv, agent), np.random.default_rng(0), []
+    env.reset()
+    for _ in range(60):
+        _, _, dones, infos = env.step(np.array([[rng.uniform(-1, 1), 1.0]]))
+        option = infos[0]["option"]
+        assert dones[0]
+        assert option["reason"] == ("reached" if option["duration"] < 40 else "expired")
+        assert "episode" in infos[0]
+        durations.append(option["duration"])
+    assert min(durations) < max(durations) == 40
+    assert len(venv.env_method("get_episode_lengths")[0]) == 60
+
+
 def test_success_terminates(agent: TBCHRL) -> None:
     env = OptionEnv(DummyVecEnv([lambda: Corridor(goal=0.0)]), agent)
     env.reset()

@@ -87,7 +87,7 @@ def test_an_option_that_was_given_up_is_cut_off_and_did_not_reach_its_subgoal() 
     clock = clock_of(OptionRules(dt_max=10.0, window_end="reconsider"), 2)
     clock.give_up(np.array([True, False]))
     assert clock.ended(corridors(2)).tolist() == [True, False]
-    option = clock.close(0, 4, reached=True, episode_over=False)
+    option = clock.close(0, 4, reached=True, cut_off=False)
     assert (option.reason, option.reached, option.duration) == (TerminationReason.RECONSIDERED, False, 4)
     clock.begin(np.array([0]), np.array([[0.0, 1.0]]))
     assert not clock.ended(corridors(2)).any()
