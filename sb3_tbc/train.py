@@ -102,7 +102,8 @@ def build_parser() -> Parser:
     where.add_argument("--tensorboard", action="store_true", help="write TensorBoard files into the run's folder")
     where.add_argument("--checkpoint-minutes", type=not_negative, default=10.0, help="time between "
                        "checkpoints for --resume; 0: after every rollout, inf: only where it is stopped")  # fmt: skip
-    where.add_argument("--keep-checkpoint", action="store_true", help="keep the last checkpoint of a finished run")
+    where.add_argument("--keep-checkpoint", action="store_true", help="keep the last checkpoint of a finished run, so "
+                       "that --resume can extend it; remembered")  # fmt: skip
     machine = parser.add_argument_group("machine")
     machine.add_argument("--device", default="cpu", help="torch device; agents of two levels learn on the CPU alone")
     machine.add_argument("--num-threads", type=positive_int, default=1,

@@ -20,6 +20,7 @@ from checks import said
 from sb3_tbc import evaluate, train
 from sb3_tbc.zoo.algorithms import load_model
 from sb3_tbc.zoo.callbacks import write_evaluations
+from sb3_tbc.zoo.checkpoints import read_checkpoint
 from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.ledger import RunFolder
 
@@ -202,7 +203,7 @@ def test_resume_goes_on_and_keeps_the_curve(run: RunFolder, tmp_path: Path) -> N
     assert copy.read_final()["n_timesteps"] == 600
     assert copy.read_evaluations()[:2] == run.read_evaluations()
     assert copy.read_evaluations()[2].wall_time > run.read_evaluations()[1].wall_time
-    assert not copy.checkpoint.exists()
+    assert copy.checkpoint.is_dir()  # --keep-checkpoint is remembered
     lines = (copy.path / "command.txt").read_text().splitlines()
     assert lines[0] == (run.path / "command.txt").read_text().strip()
     assert lines[1:] == [f"python -m sb3_tbc.train --resume {copy.path} --n-timesteps 600 --no-progress"]
@@ -309,7 +310,7 @@ def test_an_extended_run_may_go_back_to_its_first_end(run: RunFolder, tmp_path: 
     """It was killed before its next checkpoint: what it had written beyond the first end goes."""
     copy = RunFolder(tmp_path / "seed_5")
     shutil.copytree(run.path, copy.path)
-    copy.reopen(400)
+    copy.reopen(read_checkpoint(copy.checkpoint))
     copy.start({**copy.read_config(), "n_timesteps": 2000}, "")
     rows = run.read_evaluations()
     write_evaluations(copy.evaluations, [*rows, rows[-1]._replace(timesteps=600)])

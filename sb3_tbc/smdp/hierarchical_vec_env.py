@@ -289,7 +289,7 @@ class HierarchicalVecEnv(CopyableVecEnvWrapper):
 
 
 def _used_up(info: Plain) -> bool:
-    """Whether the episode ended with the last window that it may have; a wrapper may end it with success in that step."""
+    """Whether the episode ended with the last window it may have; a wrapper may end it with success in that step."""
     return bool(info.get("TimeLimit.truncated", False) and info.get(BUDGET_EXHAUSTED, False))
 
 

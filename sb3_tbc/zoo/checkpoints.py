@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,9 @@ from sb3_tbc.files import digest, explained, remove, sync, write_atomic
 
 NEWEST, BEFORE, BROKEN = "checkpoint", "checkpoint.old", "checkpoint.broken"
 UNFINISHED = "checkpoint.new*"
-MODEL, REPLAY, STATE = "model.zip", "replay_buffer.pkl", "state.json"
+MODEL, REPLAY, STATE, BEST = "model.zip", "replay_buffer.pkl", "state.json", "best_model.zip"
+KEPT = "kept"
+"""In a checkpoint's state: whether it stays when the run is finished."""
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +50,11 @@ class Checkpoint:
         """Replay buffers, random streams, running episodes."""
         return self.path / REPLAY
 
+    @property
+    def best_model(self) -> Path:
+        """The run's best agent so far; there is none before the first evaluation."""
+        return self.path / BEST
+
 
 def save_checkpoint(
     run: Path,
@@ -54,11 +62,13 @@ def save_checkpoint(
     wall_time: float,
     save_model: Callable[[Path], object],
     save_replay: Callable[[Path], object],
+    kept: bool = False,
 ) -> None:
     """Write a checkpoint into a run's folder; the previous one is kept, the one before that is removed.
 
     :param save_model: writes the agent to a path
     :param save_replay: writes the replay buffers to a path
+    :param kept: whether it is to stay when the run is finished; remembered for the run's later parts
     :raises WriteError: if it cannot be written; the earlier checkpoints are then unchanged
     """
     newest, before, new = run / NEWEST, run / BEFORE, run / "checkpoint.new"
@@ -68,9 +78,11 @@ def save_checkpoint(
             new.mkdir(parents=True)
             save_model(new / MODEL)
             save_replay(new / REPLAY)
-            for name in (MODEL, REPLAY):
-                sync(new / name)
-            write_atomic(new / STATE, _state(new, timesteps, wall_time))
+            if (run / BEST).is_file():  # a later one would be of an evaluation that a resumed run repeats
+                shutil.copyfile(run / BEST, new / BEST)
+            for path in new.iterdir():
+                sync(path)
+            write_atomic(new / STATE, _state(new, timesteps, wall_time, kept))
             sync(run)
     except BaseException:
         remove(new)
@@ -84,11 +96,12 @@ def save_checkpoint(
     remove(run / BROKEN)
 
 
-def _state(folder: Path, timesteps: int, wall_time: float) -> str:
+def _state(folder: Path, timesteps: int, wall_time: float, kept: bool) -> str:
     state = {
         "timesteps": timesteps,
         "wall_time": wall_time,
-        "sha256": {name: digest(folder / name) for name in (MODEL, REPLAY)},
+        KEPT: kept,
+        "sha256": {path.name: digest(path) for path in sorted(folder.iterdir())},
     }
     return json.dumps({**state, "state_sha256": _sum_of(state)}, indent=2) + "\n"
 
@@ -124,12 +137,21 @@ def has_checkpoint(run: Path) -> bool:
 
 def steps_done(run: Path) -> int:
     """Environment steps of the newest checkpoint as it says itself, 0 without one; no other file is read."""
+    return _said(run, "timesteps", 0)
+
+
+def is_kept(run: Path) -> bool:
+    """Whether the newest checkpoint says that it stays when the run is finished; no other file is read."""
+    return bool(_said(run, KEPT, 0))
+
+
+def _said(run: Path, name: str, missing: int) -> int:
     for folder in _candidates(run):
         try:
-            return int(json.loads((folder / STATE).read_text(encoding="utf-8"))["timesteps"])
+            return int(json.loads((folder / STATE).read_text(encoding="utf-8"))[name])
         except (OSError, ValueError, TypeError, KeyError, RecursionError, OverflowError):
             continue
-    return 0
+    return missing
 
 
 def _candidates(run: Path) -> Iterator[Path]:
@@ -151,7 +173,7 @@ def read_checkpoint(folder: Path) -> Checkpoint:
         sums = dict(state.get("sha256", {}))
     except (OSError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError) as error:
         raise ConfigError(f"{path} is damaged ({error})") from error
-    for name in (MODEL, REPLAY):
+    for name in (MODEL, REPLAY, *({BEST} & sums.keys())):
         if not (folder / name).is_file():
             raise ConfigError(f"{folder / name} is missing")
         if name in sums and sums[name] != digest(folder / name):

@@ -6,6 +6,7 @@ import json
 import math
 import platform
 import re
+import shutil
 import subprocess
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,12 +21,12 @@ import yaml
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import AnyArray
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.files import remove, remove_temporary, write_atomic
+from sb3_tbc.files import remove, remove_temporary, save_atomic, write_atomic
 from sb3_tbc.outside import flat_name, folder_name
 from sb3_tbc.reading import read_json, read_yaml
 from sb3_tbc.stats import stability, wilson_interval
 from sb3_tbc.zoo.callbacks import EvaluationRow, finite_mean, read_evaluations, write_evaluations
-from sb3_tbc.zoo.checkpoints import NEWEST, has_checkpoint, remove_checkpoints, remove_unfinished
+from sb3_tbc.zoo.checkpoints import BEST, NEWEST, Checkpoint, has_checkpoint, remove_checkpoints, remove_unfinished
 from sb3_tbc.zoo.curves import EVALUATION_EPISODES, MONITOR
 
 CONFIG, COMMAND, VERSIONS, EVALUATIONS, FINAL = (
@@ -170,7 +171,7 @@ class RunFolder:
     @property
     def best_model(self) -> Path:
         """The agent with the best evaluation."""
-        return self.path / "best_model.zip"
+        return self.path / BEST
 
     @property
     def checkpoint(self) -> Path:
@@ -262,8 +263,14 @@ class RunFolder:
         later += [now] if now != [first, *later][-1] else []
         return {**first, RESUMED: later} if later else first
 
-    def reopen(self, timesteps: int) -> None:
-        """Rename files that a run resumed from this step writes anew; an earlier result keeps its step in its name."""
+    def reopen(self, checkpoint: Checkpoint) -> None:
+        """Rename files that a run resumed from there writes anew; an earlier result keeps its step in its name.
+
+        Learning curve and best agent go back to what they were.
+        """
+        timesteps = checkpoint.timesteps
+        if checkpoint.best_model.is_file():  # before the curve: if this fails, the next attempt finds all as it was
+            save_atomic(lambda name: shutil.copyfile(checkpoint.best_model, name), self.best_model)
         if self.finished:
             self._put_aside(FINAL, timesteps)
         self.drop_evaluations_after(timesteps)

@@ -27,7 +27,7 @@ from sb3_tbc.stopping import StopEvaluation, StoppableVecEnv, StopRequest
 from sb3_tbc.tbc_hrl.evaluation import Agent, evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, build_model, load_model, read_zip
 from sb3_tbc.zoo.callbacks import OptionTraceCallback, StopTraining, SuccessEvalCallback, TimedCheckpointCallback
-from sb3_tbc.zoo.checkpoints import find_checkpoint, keep_only, remove_checkpoints, save_checkpoint
+from sb3_tbc.zoo.checkpoints import find_checkpoint, is_kept, keep_only, remove_checkpoints, save_checkpoint
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.curves import MONITOR, TrainingMonitor
 from sb3_tbc.zoo.environments import make_envs
@@ -122,7 +122,7 @@ class RunOptions:
     :param tensorboard: write TensorBoard files into the run folder
     :param trace: write ``options.csv``
     :param checkpoint_seconds: time between checkpoints; with infinity the only one is that of a stopped run
-    :param keep_checkpoint: keep the last checkpoint (with replay buffers) of a finished run
+    :param keep_checkpoint: keep the last checkpoint (with replay buffers) of a finished run; a resumed one remembers it
     :param save_at_end: save a checkpoint when training is stopped or an environment fails
     :param trust: whether a checkpoint may run code, see :func:`.load_model`
     :param stop: tells whether the user asked to stop; training stops at the next point from which it can be resumed
@@ -210,6 +210,7 @@ def resume_run(folder: RunFolder, options: RunOptions, n_timesteps: int | None =
         return folder.read_final()
     if n_timesteps is not None:
         spec = replace(spec, run=replace(spec.run, n_timesteps=n_timesteps))
+    options = replace(options, keep_checkpoint=options.keep_checkpoint or is_kept(folder.path))
     with locked(folder.path):
         with explained(folder.path):
             folder.tidy()
@@ -257,9 +258,9 @@ def _go_on(spec: RunSpec, folder: RunFolder, options: RunOptions, command: str) 
     try:
         model = load_model(checkpoint.model, env, options.device, options.trust)
         _load_replay(model, checkpoint.replay_buffer)
-        keep_only(folder.path, checkpoint)
+        checkpoint = keep_only(folder.path, checkpoint)
         with explained(folder.path):
-            folder.reopen(done)
+            folder.reopen(checkpoint)
         folder.start(spec.to_dict(), command)
         return Training(model, spec, folder, options, checkpoint.wall_time).run()
     finally:
@@ -331,7 +332,8 @@ class Training:
         for file in self.written:
             file.flush()
         steps, replay = int(self.model.num_timesteps), save_replay or self.model.save_replay_buffer
-        save_checkpoint(self.folder.path, steps, self.evaluations.wall_time, self.model.save, replay)
+        wall_time, kept = self.evaluations.wall_time, self.options.keep_checkpoint
+        save_checkpoint(self.folder.path, steps, wall_time, self.model.save, replay, kept)
 
     def _train(self) -> None:
         """Train; an early end gives a message of one line that also names the checkpoint to resume from."""
