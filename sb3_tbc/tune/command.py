@@ -27,6 +27,7 @@ from sb3_tbc.tune.search_space import complete, load_space, restrict
 from sb3_tbc.zoo.algorithms import algorithm, build_model
 from sb3_tbc.zoo.config import CONFIGS, RunConfig, config_file, load_config, parse_overrides, read_file
 from sb3_tbc.zoo.environments import make_envs, resolve_env
+from sb3_tbc.zoo.ledger import RunFolder
 
 if TYPE_CHECKING:
     from optuna.study import Study
@@ -330,9 +331,16 @@ def train_from(args: argparse.Namespace, study: Study, settings: StudySettings, 
     seed = settings.seeds.stop if args.seed is None else args.seed
     if seed in settings.seeds:
         print(f"note           seed {seed} is one of those on which the trials were chosen; results on it are biased")
+    root = folder / "train"
+    run = RunFolder.for_run(root, settings.task, settings.algo, path.stem, seed)
+    if run.exists and not args.overwrite:  # here, as training would name options of its own
+        state = "finished" if run.finished else "unfinished"
+        cure = "use --overwrite or another --seed" + ("" if run.finished else ", or continue it with: ")
+        cure += "" if run.finished else f"{python()} -m sb3_tbc.train --resume {shlex.quote(str(run.path))}"
+        raise ConfigError(f"{run.path} holds the {state} run of this trial and seed; nothing was changed: {cure}")
     own = {name: value for name, value in asked(args).items() if name in TRAINING}
     arguments = train_arguments(settings, path, seed, own)
-    arguments += ["--log-folder", str(folder / "train"), "--device", args.device]
+    arguments += ["--log-folder", str(root), "--device", args.device]
     return train.command([*arguments, *(["--overwrite"] if args.overwrite else [])])
 
 

@@ -148,6 +148,8 @@ def test_train_from_a_trial(searched: Path, which: str, capsys: pytest.CaptureFi
     made = yaml.safe_load(runs[0].read_text())
     assert [str(made[name[2:].replace("-", "_")]) for name in own[::2]] == own[1::2]
     assert made["model"] == read_settings(study).config_of(study.trials[number]).model
+    assert tune.main(arguments(searched, "--trial", which, *own, *more)) == 2  # a second time
+    assert "nothing was changed: use --overwrite or another --seed" in capsys.readouterr().err
 
 
 def test_resuming_needs_no_options_and_counts_what_is_done(searched: Path, capsys: pytest.CaptureFixture[str]) -> None:
