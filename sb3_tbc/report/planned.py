@@ -13,7 +13,7 @@ from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_yaml
 from sb3_tbc.report.runs import SHIPPED, Results, Run
-from sb3_tbc.zoo.config import N_EVAL_EPISODES, OF_PAPER, default_eval_freq, load_config
+from sb3_tbc.zoo.config import ABLATIONS, N_EVAL_EPISODES, OF_PAPER, default_eval_freq, load_config
 
 CAMPAIGN = "campaign.yml"
 """In the folder of results: ``first_seed``, ``options`` of every command, and ``runs`` with task, methods, seeds, and
@@ -56,15 +56,23 @@ class Planned(NamedTuple):
         counts = {"eval_freq": freq or default_eval_freq(steps), "n_eval_episodes": episodes or N_EVAL_EPISODES}
         return {"n_timesteps": steps, **counts}
 
+    @property
+    def gone(self) -> bool:
+        """Whether the plan names an ablation that there is no longer: nobody can make its missing runs."""
+        return self.ablation is not None and self.ablation not in ABLATIONS
+
     def _option(self, name: str) -> int:
         return int(self.options[self.options.index(name) + 1]) if name in self.options else 0
 
     def done_by(self, run: Run) -> bool:
         """Whether a run is one of these; what it does not say of itself is taken to be so."""
-        return run.seed in self.seeds and all(run.config.get(k, v) == v for k, v in self.evaluated().items())
+        known = {} if self.gone else self.evaluated()
+        return run.seed in self.seeds and all(run.config.get(k, v) == v for k, v in known.items())
 
     def command(self) -> str:
-        """The command that makes the runs."""
+        """The command that makes the runs; in its place a sentence where there is none."""
+        if self.gone:
+            return f"none: no ablation {one_line(repr(self.ablation))}; {nearest(str(self.ablation), ABLATIONS)}"
         words = ["python", "-m", "sb3_tbc.reproduce", "--tasks", self.task, "--algos", self.algo]
         words += ["--first-seed", str(self.seeds.start), "--seeds", str(len(self.seeds))]
         words += ["--config", self.config] if self.config else []
@@ -149,6 +157,8 @@ def _check_equal(rows: list[Planned]) -> None:
     """
     first: dict[str, Planned] = {}
     for row in rows:
+        if row.gone:
+            continue
         other = first.setdefault(row.task, row)
         if other.options != row.options:
             raise ConfigError(

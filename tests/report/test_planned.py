@@ -128,3 +128,14 @@ def test_keys_of_a_plan_that_nobody_reads_or_that_are_missing(plan: str, said: s
     (tmp_path / "campaign.yml").write_text(plan if plan == "{}" else f"first_seed: 0\n{plan}\n")
     with pytest.raises(ConfigError, match=said):
         missing_table(tmp_path, {})
+
+
+def test_a_planned_ablation_that_no_longer_exists_is_told_in_its_row_and_ends_no_report(tmp_path: Path) -> None:
+    fake_run(tmp_path, "Pendulum", "tbc-hrl", 0, 1.0, config={"n_timesteps": 500})
+    rows = "{task: Pendulum, seeds: 1, n_timesteps: 500, methods: [tbc-hrl, tbc-hrl no-tz, tbc-hrl no-tz-paper, hits]}"
+    (tmp_path / "campaign.yml").write_text(f"{{first_seed: 0, runs: [{rows}]}}")
+    _, *missing = missing_table(tmp_path, load_results(tmp_path))
+    told = {method: (done, command) for _, method, done, command in missing}
+    for method in ("tbc-hrl no-tz", "tbc-hrl no-tz-paper"):
+        assert told[method] == ("0 of 1", "none: no ablation 'no-tz'; did you mean 'no-ts'?")
+    assert "--algos hits" in told["hits"][1]
