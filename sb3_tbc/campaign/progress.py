@@ -12,7 +12,6 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from sb3_tbc.campaign.jobs import Job
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
-from sb3_tbc.report.checked import check_final
 
 EVERY = 2.0
 """Seconds between two looks into the runs' folders."""
@@ -22,11 +21,9 @@ def _result(job: Job) -> str:
     """A run's result in words; one that says nothing sensible, which a report refuses, ends no campaign."""
     try:
         final = job.target.read_final()
-        check_final(final)
         return f"success {final['success_rate']:.2f} at {final['n_timesteps']:,} steps"
-    except (ConfigError, KeyError) as error:
-        said = f"{error.args[0]} is missing" if isinstance(error, KeyError) else one_line(error)
-        return f"(its final.json is not understood, and a report will refuse it: {said})"
+    except (ConfigError, KeyError, TypeError, ValueError) as error:
+        return f"(its final.json is not understood, and a report will refuse it: {one_line(repr(error))})"
 
 
 class Board:

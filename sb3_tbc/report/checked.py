@@ -58,7 +58,7 @@ def _check_outcomes(final: PlainMapping) -> None:
 
 
 def _check_share(rate: float, episodes: float | None, where: str) -> None:
-    """Refuse a success rate that no number of successes in so many episodes gives.
+    """Refuse a success rate that no number of successes in that number of episodes gives.
 
     :raises ConfigError: naming both
     """

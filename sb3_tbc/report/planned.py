@@ -58,7 +58,7 @@ class Planned(NamedTuple):
 
     @property
     def gone(self) -> bool:
-        """Whether the plan names an ablation that there is no longer: nobody can make its missing runs."""
+        """Whether the plan names an ablation that no longer exists: nobody can make its missing runs."""
         return self.ablation is not None and self.ablation not in ABLATIONS
 
     def _option(self, name: str) -> int:

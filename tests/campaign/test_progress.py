@@ -17,9 +17,9 @@ from sb3_tbc.zoo.ledger import RunFolder
     ("final", "told"),
     [
         ('{"success_rate": 0.5, "n_timesteps": 1000}', "success 0.50 at 1,000 steps"),
-        ("{}", "will refuse it: success_rate must be"),
-        ('{"success_rate": "much", "n_timesteps": 5}', "will refuse it: success_rate must be"),
-        ('{"success_rate": 1.0}', "will refuse it: n_timesteps is missing"),
+        ("{}", "will refuse it: KeyError('success_rate')"),
+        ('{"success_rate": "much", "n_timesteps": 5}', "will refuse it: ValueError("),
+        ('{"success_rate": 1.0}', "will refuse it: KeyError('n_timesteps')"),
         ("[]", "will refuse it: "),
     ],
 )
