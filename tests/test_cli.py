@@ -45,9 +45,7 @@ def run(root: Path) -> RunFolder:
     return RunFolder.for_run(root, "Pendulum", "tbc-hrl", "custom", 5)
 
 
-def test_the_evaluation_that_is_printed_works_for_a_task_of_ones_own(
-    tmp_path: Path, monkeypatch: Any, capsys: Any
-) -> None:
+def test_the_evaluation_that_is_printed_finds_ones_own_task(tmp_path: Path, monkeypatch: Any, capsys: Any) -> None:
     register = "gymnasium.register('Own-v0', corridor.Corridor, max_episode_steps=20)"
     (tmp_path / "own_tasks.py").write_text(f"import corridor, gymnasium\n{register}\n")
     monkeypatch.syspath_prepend(tmp_path)

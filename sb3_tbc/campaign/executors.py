@@ -150,7 +150,8 @@ class SlurmHandle:
 
     def stop(self) -> None:
         """Cancel the job; Slurm asks the run to end first."""
-        with contextlib.suppress(Exception):  # scancel fails for a job that has just ended, and others must be asked
+        # scancel fails for a job that has just ended, and the others must still be asked
+        with contextlib.suppress(subprocess.SubprocessError, OSError):
             self.job.cancel()
 
 
