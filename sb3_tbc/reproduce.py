@@ -45,7 +45,7 @@ from sb3_tbc.zoo.config import (
 )
 from sb3_tbc.zoo.environments import resolve_env, task_names
 from sb3_tbc.zoo.ledger import RunFolder
-from sb3_tbc.zoo.runner import RunSpec
+from sb3_tbc.zoo.run_spec import RunSpec
 
 EXAMPLES = {
     "sb3_tbc.reproduce --dry-run": "what would run, and how many hours it takes",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,8 @@ from sb3_tbc.zoo.config import (
 )
 from sb3_tbc.zoo.environments import resolve_env
 from sb3_tbc.zoo.ledger import RunFolder
-from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, resume_run, start_run
+from sb3_tbc.zoo.run_spec import RunOptions, RunSpec
+from sb3_tbc.zoo.runner import Interrupted, resume_run, start_run
 from sb3_tbc.zoo.settings_page import settings_text
 
 NOT_RESUMED = (
@@ -49,6 +50,8 @@ NOT_RESUMED = (
     *("eval_freq", "n_eval_episodes", "n_final_episodes", "log_folder", "variant", "overwrite"),
 )
 """Options that say what a new run is; a resumed one has them from its ``config.yml``."""
+NOT_REMEMBERED = ("ledger", "trace", "tensorboard", "checkpoint_minutes", "device", "num_threads", "trust")
+"""Options of how a run is carried out; to continue alike, they are given again."""
 EXAMPLES = {
     "sb3_tbc.train": "TBC-HRL on Pendulum; the run is kept in runs/Pendulum/tbc-hrl/full/seed_0",
     "sb3_tbc.train --list": "which tasks and algorithms there are, and how long a run takes",
@@ -226,12 +229,12 @@ def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> 
         keep_checkpoint=args.keep_checkpoint,
         stop=stop,
         trust=args.trust,
+        again=tuple(_again(args)),
     )
     try:
         folder, result = _run(args, options, argv)
     except Interrupted as stopped:
-        where = shlex.quote(str(stopped.folder))
-        print(f"{stopped}; continue with: {python()} -m sb3_tbc.train --resume {where}", file=sys.stderr)
+        print(f"{stopped}; continue with: {options.resume_line(stopped.folder)}", file=sys.stderr)
         return INTERRUPTED
     print(describe(result, folder))
     if args.ledger is not None:
@@ -239,6 +242,17 @@ def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> 
         folder.copy_to(target)
         print(f"ledger         {target.path}")
     return 0
+
+
+def _again(args: argparse.Namespace) -> Iterator[str]:
+    """Yield the options given that a run does not remember, for the command that continues it."""
+    parser = build_parser()
+    for name in NOT_REMEMBERED:
+        value = getattr(args, name)
+        if value != parser.get_default(name):
+            yield f"--{name.replace('_', '-')}"
+            if value is not True:
+                yield str(value)
 
 
 def _run(args: argparse.Namespace, options: RunOptions, argv: Sequence[str]) -> tuple[RunFolder, Plain]:

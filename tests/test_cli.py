@@ -412,7 +412,7 @@ def test_a_flipped_byte_is_noticed(run: RunFolder, tmp_path: Path, capsys: pytes
 
 
 def test_config_of_a_run_builds_the_same_run(run: RunFolder) -> None:
-    from sb3_tbc.zoo.runner import RunSpec
+    from sb3_tbc.zoo.run_spec import RunSpec
 
     data = yaml.safe_load((run.path / "config.yml").read_text())
     assert RunSpec.from_dict(data).to_dict() == data

@@ -16,7 +16,7 @@ from sb3_tbc.commands import FAILED, INTERRUPTED, USER_MISTAKE
 from sb3_tbc.errors import ConfigError, WriteError
 from sb3_tbc.files import in_use
 from sb3_tbc.outside import one_line
-from sb3_tbc.zoo.runner import RunSpec
+from sb3_tbc.zoo.run_spec import RunSpec
 
 PAUSE = 0.2
 """Seconds between two looks at the running jobs."""

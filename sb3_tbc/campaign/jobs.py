@@ -15,7 +15,8 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.reading import read_json
 from sb3_tbc.zoo.checkpoints import steps_done
 from sb3_tbc.zoo.ledger import RunFolder, to_json
-from sb3_tbc.zoo.runner import RunSpec, trained_steps
+from sb3_tbc.zoo.run_spec import RunSpec
+from sb3_tbc.zoo.runner import trained_steps
 
 FAILED = "failed.json"
 """File in the ledger's folder of a failed run: exit status, number of attempts and last message."""

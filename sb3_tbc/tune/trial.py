@@ -21,7 +21,8 @@ from sb3_tbc.tune.study import COUNTED, ORIGIN, REASON, WORKER, StudySettings
 from sb3_tbc.zoo.callbacks import EvaluationRow, SuccessEvalCallback
 from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.ledger import RunFolder
-from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, start_run
+from sb3_tbc.zoo.run_spec import RunOptions, RunSpec
+from sb3_tbc.zoo.runner import Interrupted, start_run
 from sb3_tbc.zoo.safety import LossWatch
 
 CURVES = "curves"

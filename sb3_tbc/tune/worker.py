@@ -39,7 +39,7 @@ from sb3_tbc.tune.study import (
 )
 from sb3_tbc.tune.trial import Stopped, Surplus, TrialRunner
 from sb3_tbc.zoo.environments import resolve_env
-from sb3_tbc.zoo.runner import RunOptions
+from sb3_tbc.zoo.run_spec import RunOptions
 
 POLL = 1.0
 """Seconds between looks at the storage while the last trials run elsewhere."""

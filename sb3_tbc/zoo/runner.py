@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -12,7 +12,6 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import python
 from sb3_tbc.errors import (
     ConfigError,
     DivergedError,
@@ -28,11 +27,11 @@ from sb3_tbc.tbc_hrl.evaluation import Agent, evaluate_agent
 from sb3_tbc.zoo.algorithms import RUN_INFO, build_model, load_model, read_zip
 from sb3_tbc.zoo.callbacks import OptionTraceCallback, StopTraining, SuccessEvalCallback, TimedCheckpointCallback
 from sb3_tbc.zoo.checkpoints import find_checkpoint, is_kept, keep_only, remove_checkpoints, save_checkpoint
-from sb3_tbc.zoo.config import RunConfig
 from sb3_tbc.zoo.curves import MONITOR, TrainingMonitor
 from sb3_tbc.zoo.environments import make_envs
 from sb3_tbc.zoo.ledger import RunFolder, curve_summary, summarise
 from sb3_tbc.zoo.rows import RowsCallback
+from sb3_tbc.zoo.run_spec import RunOptions, RunSpec
 from sb3_tbc.zoo.safety import CURE, ConsistentState, DivergenceCallback, check_weights
 
 TRAINED = "wall_time"
@@ -54,90 +53,6 @@ def evaluation_seed(seed: int) -> int:
 def final_seed(seed: int) -> int:
     """Seed of the evaluation after training; they are a thousand apart, so no two training seeds share an episode."""
     return (2_000_000 + 1_000 * seed) % 2**32
-
-
-@dataclass(frozen=True)
-class RunSpec:
-    """A run: what is trained (:class:`RunConfig`), on which seed, and how it is evaluated.
-
-    :param run: algorithm, task, settings
-    :param env_id: environment id of the task
-    :param variant: folder name: ``full``, ``custom``, an ablation, or a name given by the user
-    :param seed: seed of everything in training
-    :param eval_freq: environment steps between evaluations
-    :param n_eval_episodes: episodes per evaluation
-    :param n_final_episodes: episodes of the evaluation after training
-    """
-
-    run: RunConfig
-    env_id: str
-    variant: str = "full"
-    seed: int = 0
-    eval_freq: int = 5000
-    n_eval_episodes: int = 20
-    n_final_episodes: int = 100
-
-    def to_dict(self) -> Plain:
-        """Return plain data for ``config.yml``; the run's own keys come first."""
-        watching = {k: v for k, v in asdict(self).items() if k != "run"}
-        run = self.run.to_dict()
-        model = run.pop("model")
-        return {**run, **watching, "model": model}
-
-    @classmethod
-    def from_dict(cls, data: Plain) -> RunSpec:
-        """Build the run from the data of ``config.yml``.
-
-        :raises ConfigError: if keys are missing or unknown
-        """
-        watching = {k: data[k] for k in cls.__dataclass_fields__ if k != "run" and k in data}
-        run = RunConfig.from_dict({k: v for k, v in data.items() if k not in watching})
-        try:
-            return cls(run=run, **watching)
-        except TypeError as error:
-            raise ConfigError(f"not a run's config.yml: {error}") from error
-
-    @property
-    def identity(self) -> Plain:
-        """What identifies a result in ``final.json`` and inside the agent's ``.zip``."""
-        run = self.run
-        return {
-            "task": run.task,
-            "algo": run.algo,
-            "variant": self.variant,
-            "config": run.config,
-            "seed": self.seed,
-            "env_id": self.env_id,
-            "env_kwargs": run.env_kwargs,
-        }
-
-
-@dataclass(frozen=True)
-class RunOptions:
-    """How a run is carried out; these options do not change its result.
-
-    :param device: torch device
-    :param progress: show a progress bar
-    :param verbose: print a line per evaluation
-    :param tensorboard: write TensorBoard files into the run folder
-    :param trace: write ``options.csv``
-    :param checkpoint_seconds: time between checkpoints; with infinity the only one is that of a stopped run
-    :param keep_checkpoint: keep the last checkpoint (with replay buffers) of a finished run; a resumed one remembers it
-    :param save_at_end: save a checkpoint when training is stopped or an environment fails
-    :param trust: whether a checkpoint may run code, see :func:`.load_model`
-    :param stop: tells whether the user asked to stop; training stops at the next point from which it can be resumed
-    """
-
-    device: str = "cpu"
-    progress: bool = False
-    verbose: int = 1
-    tensorboard: bool = False
-    trace: bool = False
-    checkpoint_seconds: float = 600.0
-    keep_checkpoint: bool = False
-    save_at_end: bool = True
-    trust: bool = False
-    stop: StopRequest = field(default_factory=StopRequest)
 
 
 def evaluation_envs(env_id: str, n_episodes: int, seed: int, env_kwargs: Plain) -> VecEnv:
@@ -396,8 +311,7 @@ class Training:
         if checkpoint is None:
             return "No checkpoint had been written yet"
         how = "Saved" if saved else "The last checkpoint is"
-        resume = f"{python()} -m sb3_tbc.train --resume {shlex.quote(str(self.folder.path))}"
-        return f"{how} at step {checkpoint.timesteps}; continue with: {resume}"
+        return f"{how} at step {checkpoint.timesteps}; continue with: {self.options.resume_line(self.folder.path)}"
 
 
 NOT_A_DISTRIBUTION = "to satisfy the constraint"
@@ -419,7 +333,7 @@ def finish(model: Agent, spec: RunSpec, folder: RunFolder, options: RunOptions, 
     except (EnvironmentFault, NonFiniteError) as error:
         raise TrainingError(
             f"the evaluation after training failed: {one_line(error, 1000)}. The agent is saved; evaluate it with: "
-            f"{python()} -m sb3_tbc.train --resume {shlex.quote(str(folder.path))}"
+            f"{options.resume_line(folder.path)}"
         ) from error
     folder.finish(result)
     if not options.keep_checkpoint:

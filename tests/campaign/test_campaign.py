@@ -27,7 +27,7 @@ from sb3_tbc.extras import MissingExtraError
 from sb3_tbc.files import locked
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.ledger import LEDGER_FILES, RunFolder
-from sb3_tbc.zoo.runner import RunSpec
+from sb3_tbc.zoo.run_spec import RunSpec
 
 
 def make_job(tmp_path: Path, seed: int = 0, env: str = "Pendulum") -> Job:

@@ -44,7 +44,8 @@ def test_stopped_by_a_signal(number: int, undisturbed: Path, tmp_path: Path) -> 
     os.kill(child, signal.SIGINT)
     assert wait(child) == 130
     text = (tmp_path / "log").read_text()
-    assert re.search(r"continue with: \S*python -m sb3_tbc.train --resume", text)
+    line = r"continue with: \S*python -m sb3_tbc.train --resume \S+seed_0 --trace --checkpoint-minutes inf\n"
+    assert re.search(line, text)
     folder = the_run(tmp_path / "runs")
     assert folder is not None
     stopped = find_checkpoint(folder)

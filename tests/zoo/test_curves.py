@@ -17,7 +17,8 @@ from sb3_tbc.tbc_hrl.evaluation import EvaluationResult
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.curves import EVALUATION_EPISODES, MONITOR, EvaluationEpisodes, TrainingMonitor
 from sb3_tbc.zoo.ledger import RunFolder
-from sb3_tbc.zoo.runner import RunOptions, RunSpec, resume_run, start_run
+from sb3_tbc.zoo.run_spec import RunOptions, RunSpec
+from sb3_tbc.zoo.runner import resume_run, start_run
 
 SMALL = {"batch_size": 16, "buffer_size": 2000, "policy_kwargs": {"net_arch": [8, 8]}}
 

@@ -18,7 +18,8 @@ from sb3_tbc.zoo.checkpoints import find_checkpoint
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.curves import EvaluationEpisodes
 from sb3_tbc.zoo.ledger import RunFolder
-from sb3_tbc.zoo.runner import Interrupted, RunOptions, RunSpec, Training, resume_run, start_run
+from sb3_tbc.zoo.run_spec import RunOptions, RunSpec
+from sb3_tbc.zoo.runner import Interrupted, Training, resume_run, start_run
 
 
 def test_the_result_is_that_of_the_trained_agent_not_the_best_of_the_curve(
