@@ -1,4 +1,4 @@
-"""Agents on the Hugging Face Hub, in the layout of SB3's own hub package, ``huggingface_sb3`` (extra ``hub``)."""
+"""Agents on the Hugging Face Hub, in the layout of SB3's own hub package, ``huggingface_sb3``; needs the extra ``hub``."""
 
 from __future__ import annotations
 
@@ -43,8 +43,7 @@ def push_to_hub(
     :raises ConfigError: if the file does not exist, ``filename`` leads out of the repository or is none of a ``.zip``,
         or the Hub refuses or cannot be reached
     """
-    # Not huggingface_sb3.push_to_hub: it finds files of the current folder alone, and empties the model card.
-    api = require("huggingface_sb3.push_to_hub", extra="hub", what="pushing to the Hub").HfApi()
+    api = require("huggingface_hub", extra="hub", what="pushing to the Hub").HfApi()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         own_card = _gather(agent, _inside(folder, filename))
@@ -89,9 +88,9 @@ def download_from_hub(repo_id: str, filename: str = MODEL) -> Path:
     :param filename: name of the file in the repository
     :raises ConfigError: if there is none, or the Hub cannot be reached
     """
-    hub = require("huggingface_sb3", extra="hub", what="loading from the Hub")
+    hub = require("huggingface_hub", extra="hub", what="loading from the Hub")
     try:
-        return Path(hub.load_from_hub(repo_id, filename))
+        return Path(hub.hf_hub_download(repo_id, filename))
     except Exception as error:  # as above
         raise ConfigError(f"cannot download {filename} of {repo_id} from the Hub: {one_line(error, 300)}") from error
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-pytest.importorskip("huggingface_sb3")
+pytest.importorskip("huggingface_hub")
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
