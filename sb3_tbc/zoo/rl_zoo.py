@@ -5,10 +5,11 @@ from __future__ import annotations
 import importlib
 import sys
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from sb3_tbc.aliases import Env, Plain, PlainMapping
+from sb3_tbc.commands import run_command
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.tasks.generic import DescribedGoalEnv
@@ -124,21 +125,28 @@ def _reading_ours(reading: Callable[[Any], tuple[Plain, Plain]]) -> Callable[[An
     return read_hyperparameters
 
 
-def main() -> None:
+def command(argv: Sequence[str]) -> int:
+    """Run a command of the zoo, which reads the process's arguments itself.
+
+    :param argv: begins with the command's name
+    :raises ConfigError: for an unknown command, without rl_zoo3, or for settings that an agent refuses
+    """
+    if not argv or argv[0] not in COMMANDS:
+        raise ConfigError(f"give a command of the zoo: {', '.join(COMMANDS)}")
+    register()
+    importlib.import_module("rl_zoo3.cli").main()
+    return 0
+
+
+def main() -> int:
     """``python -m sb3_tbc.zoo.rl_zoo train --algo hits --env sb3_tbc/Pendulum-v0``: the zoo's commands with ours in it.
 
-    :raises SystemExit: for an unknown command, or without rl_zoo3
+    :return: exit status
     """
-    if len(sys.argv) < 2 or sys.argv[1] not in COMMANDS:
-        raise SystemExit(f"sb3_tbc.zoo.rl_zoo: error: give a command of the zoo: {', '.join(COMMANDS)}")
-    try:
-        register()
-    except ConfigError as error:
-        raise SystemExit(f"sb3_tbc.zoo.rl_zoo: error: {error}") from error
-    importlib.import_module("rl_zoo3.cli").main()
+    return run_command(command, "sb3_tbc.zoo.rl_zoo")
 
 
 if __name__ == "__main__":
     from sb3_tbc.zoo.rl_zoo import main as run  # under its own name: the zoo keeps what it is told
 
-    run()
+    sys.exit(run())

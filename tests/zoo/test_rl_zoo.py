@@ -6,6 +6,7 @@ import importlib
 import pickle
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from corridor import Corridor
 
 import sb3_tbc.zoo
 from sb3_tbc.extras import MissingExtraError
+from sb3_tbc.tbc_hrl import HiTS
+from sb3_tbc.zoo import rl_zoo
 from sb3_tbc.zoo.rl_zoo import IN_ZOO, main, nested, with_subgoals, zoo_settings
 
 TASK = "sb3_tbc/Drawbridge-v0"
@@ -40,10 +43,21 @@ def test_without_the_zoo_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize("arguments", [[], ["nonsense"]])
-def test_an_unknown_command_is_told_in_one_line(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_command_is_told_in_one_line(arguments: list[str], monkeypatch: Any, capsys: Any) -> None:
     monkeypatch.setattr(sys, "argv", ["rl_zoo", *arguments])
-    with pytest.raises(SystemExit, match="give a command of the zoo: train, enjoy"):
-        main()
+    assert main() == 2
+    assert "error: give a command of the zoo: train, enjoy" in capsys.readouterr().err
+
+
+def test_a_refused_setting_is_told_in_one_line(monkeypatch: Any, capsys: Any) -> None:
+    def train() -> None:
+        HiTS("MultiInputPolicy", TASK, high={"learning_start": 1})
+
+    monkeypatch.setattr(rl_zoo, "register", lambda: None)
+    monkeypatch.setitem(sys.modules, "rl_zoo3.cli", SimpleNamespace(main=train))
+    monkeypatch.setattr(sys, "argv", ["rl_zoo", "train"])
+    assert main() == 2
+    assert capsys.readouterr().err.startswith("sb3_tbc.zoo.rl_zoo: error: unknown setting 'high.learning_start'")
 
 
 def command(monkeypatch: pytest.MonkeyPatch, name: str, *arguments: str) -> None:
