@@ -259,7 +259,7 @@ def command(argv: Sequence[str]) -> int:
 
 def search(args: argparse.Namespace, study: Study, settings: StudySettings, storage: str, folder: Path) -> int:
     """Run the workers and write the results."""
-    from sb3_tbc.tune.study import count_done, shown, try_sampler
+    from sb3_tbc.tune.study import count_done, shown, told_if_lost, try_sampler
     from sb3_tbc.tune.worker import Job, run_workers
 
     try_sampler(args.sampler, settings)
@@ -271,13 +271,14 @@ def search(args: argparse.Namespace, study: Study, settings: StudySettings, stor
     job = Job(storage, study.study_name, folder, args.n_trials, args.sampler, args.pruner, args.sampler_seed,
               args.device, args.grace_seconds, until)  # fmt: skip
     status = 0
-    try:
-        with stop_request() as stop:
-            status = run_workers(job, args.workers, stop)
-    except KeyboardInterrupt:
-        print("\nstopped; the same command continues", file=sys.stderr)
-        status = INTERRUPTED
-    summarise(study, settings, folder)
+    with told_if_lost(storage):
+        try:
+            with stop_request() as stop:
+                status = run_workers(job, args.workers, stop)
+        except KeyboardInterrupt:
+            print("\nstopped; the same command continues", file=sys.stderr)
+            status = INTERRUPTED
+        summarise(study, settings, folder)
     return status
 
 

@@ -178,6 +178,8 @@ def _open(storage: str, grace: int) -> BaseStorage:
 
 def _first_line(error: Exception, storage: str) -> str:
     """First line of a driver's message, with the password hidden wherever it occurs."""
+    if isinstance(error, optuna.exceptions.StorageInternalError) and isinstance(error.__cause__, Exception):
+        error = error.__cause__  # Optuna's own words are the same for every failure of a database
     text = str(error).replace(storage, shown(storage)).strip() or type(error).__name__
     before, hidden, after = shown(storage).partition(HIDDEN)
     secret = storage[len(before) : len(storage) - len(after)] if hidden else ""
@@ -199,6 +201,20 @@ def readable(storage: str) -> Iterator[None]:
     except Exception as error:  # damaged data raise errors of any type
         text = _first_line(error, storage)
         raise ConfigError(f"cannot read storage {shown(storage)}, it may be damaged: {text}") from error
+
+
+@contextlib.contextmanager
+def told_if_lost(storage: str) -> Iterator[None]:
+    """Turn a database's failure during a search, e.g. one that is locked or gone, into a message of one line.
+
+    :param storage: its name
+    :raises ConfigError: if it fails; the message does not contain the password
+    """
+    try:
+        yield
+    except optuna.exceptions.StorageInternalError as error:
+        text = _first_line(error, storage)
+        raise ConfigError(f"storage {shown(storage)} has failed: {text}; the same command continues") from error
 
 
 def claim_folder(folder: Path, storage: str, fresh: bool) -> None:

@@ -36,6 +36,7 @@ from sb3_tbc.tune.study import (
     read_settings,
     requeue,
     retire_stale,
+    told_if_lost,
 )
 from sb3_tbc.tune.trial import Stopped, Surplus, TrialRunner
 from sb3_tbc.zoo.environments import resolve_env
@@ -265,7 +266,7 @@ def _main(job: Job, index: int) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     th.set_num_threads(1)
     try:
-        with stop_request() as stop:
+        with stop_request() as stop, told_if_lost(job.storage):
             _hear_ctrl_c()
             work(job, index, stop)
     except KeyboardInterrupt:

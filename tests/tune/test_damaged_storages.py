@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_tbc.tune import command, study
+from sb3_tbc.tune import command, study, worker
 
 SMALL = ["--env", "Pendulum", "--n-timesteps", "200", "--eval-freq", "200", "--n-seeds", "1", "--n-eval-episodes", "1"]
 SMALL += ["--n-final-episodes", "1", "--n-trials", "1", "--hyperparams", "compile:false", "gradient_ratio:0.01"]
@@ -56,3 +56,20 @@ def test_one_line_or_read(
             assert said.count("\n") == 0, said
             assert str(path) in said or "'tbc-hrl-Pendulum'" in said  # the storage, or the study
     assert told > 3
+
+
+def test_a_database_that_fails_during_a_search_is_told_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "study.db"
+
+    def lose(*_: object) -> int:
+        with sqlite3.connect(path) as database:
+            database.execute("DROP TABLE trials")
+        return 0
+
+    monkeypatch.setattr(worker, "run_workers", lose)
+    assert command.main(["--log-folder", str(tmp_path), "--storage", f"sqlite:///{path}", *SMALL]) == 2
+    said = capfd.readouterr().err.strip()
+    assert "has failed: (sqlite3.OperationalError) no such table: trials" in said
+    assert said.count("\n") == 0
