@@ -1,4 +1,4 @@
-"""Agents on the Hugging Face Hub, in the layout of SB3's own hub package, ``huggingface_sb3``; needs the extra ``hub``."""
+"""Agents on the Hugging Face Hub (extra ``hub``), in the layout of SB3's own hub package, ``huggingface_sb3``."""
 
 from __future__ import annotations
 

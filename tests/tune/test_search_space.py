@@ -300,3 +300,9 @@ def test_mistakes_in_a_file(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         load_space("tbc-hrl", "Pendulum", path)
+
+
+def test_a_file_without_a_section_for_the_task_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "space.yml").write_text("Pendulm: {low.tau: null}")
+    with pytest.raises(ConfigError, match="neither a section default nor one of Pendulum; did you mean 'Pendulm'"):
+        load_space("tbc-hrl", "Pendulum", tmp_path / "space.yml")
