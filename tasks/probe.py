@@ -41,37 +41,64 @@ def run_probe(env: Env, n_steps: int, seed: int = 0, episode_steps: int = 50) ->
     """Run random actions, each held for five steps, in short episodes.
 
     The environment's own random stream is put back afterwards. The last episode is left unfinished, so that the
-    environment has to be reset before it is used.
+    environment has to be reset before it is used. A step whose values are not finite, or not of their space's shapes,
+    is left out and ends its episode: the agent's setting ``on_bad_step`` says what becomes of such steps.
 
     :param env: a goal environment; arrays are copied, because some environments hand out the same ones every step
     :param n_steps: steps together
     :param seed: of the first reset and of the actions
     :param episode_steps: longest episode
-    :raises ValueError: if an observation is not finite
+    :raises ValueError: if a reset, or every step, gives such values
     """
     rng, actions = np.random.default_rng(seed), env.action_space
     assert isinstance(actions, spaces.Box)
     with _random_stream_kept(env):
-        seen = [_copied(env.reset(seed=seed)[0])]
+        seen = [_first(env, seed)]
         after, rewards, terminations, successes = [], [], [], []
-        action, ended = actions.low, False
+        action, ended, wrong = actions.low, False, None
         for step in range(n_steps):
             if ended or step % episode_steps == episode_steps - 1:
-                seen.append(_copied(env.reset()[0]))
+                seen.append(_first(env))
             if step % 5 == 0:
                 action = rng.uniform(actions.low, actions.high).astype(actions.dtype)
             observation, reward, terminated, truncated, info = env.step(action)
-            after.append(len(seen))
-            seen.append(_copied(observation))
-            rewards.append(float(reward))
-            terminations.append(bool(terminated))
-            successes.append(said_success(info))
-            ended = terminated or truncated
+            wrong = _what_is_wrong(env, observation, float(reward))
+            ended = bool(terminated or truncated or wrong)
+            if wrong is None:
+                after.append(len(seen))
+                seen.append(_copied(observation))
+                rewards.append(float(reward))
+                terminations.append(bool(terminated))
+                successes.append(said_success(info))
+    if not after:
+        raise ValueError(f"{wrong} in every step of random episodes")
     stacked = {key: np.stack([observation[key] for observation in seen]) for key in GOAL_KEYS}
-    for key, part in stacked.items():
-        if not np.isfinite(part).all():
-            raise ValueError(f"observation[{key!r}] of {type(env.unwrapped).__name__} is not finite in random episodes")
     return Probe(stacked, np.array(after), np.array(rewards), np.array(terminations), successes)
+
+
+def _first(env: Env, seed: int | None = None) -> dict[str, Floats]:
+    """What a reset shows.
+
+    :raises ValueError: if it is not finite, or of another shape than its space says
+    """
+    observation, _ = env.reset(seed=seed)
+    wrong = _what_is_wrong(env, observation)
+    if wrong is not None:
+        raise ValueError(f"{wrong} at a reset in random episodes")
+    return _copied(observation)
+
+
+def _what_is_wrong(env: Env, observation: GoalObservation, reward: float = 0.0) -> str | None:
+    """What is not finite, or of another shape than its space says; None if nothing is."""
+    assert isinstance(env.observation_space, spaces.Dict)
+    whose = f"of {type(env.unwrapped).__name__}"
+    for key in GOAL_KEYS:
+        shape, given = env.observation_space[key].shape, np.shape(observation.get(key))
+        if given != shape:
+            return f"observation[{key!r}] {whose} has shape {given}, not {shape} as its space says,"
+        if not np.isfinite(observation[key]).all():
+            return f"observation[{key!r}] {whose} is not finite"
+    return None if np.isfinite(reward) else f"the reward {whose} is {reward}"
 
 
 def _copied(observation: GoalObservation) -> dict[str, Floats]:

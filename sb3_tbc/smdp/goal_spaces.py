@@ -42,10 +42,13 @@ def _action_problems(action: Space) -> list[str]:
             f"its actions must be real numbers, got {action}: an agent's actions lie anywhere between the bounds; "
             "declare Box(..., dtype=numpy.float32), and round them in the environment's step"
         ]
-    if not np.all(np.isfinite(action.low) & np.isfinite(action.high)):
+    with np.errstate(over="ignore", invalid="ignore"):
+        span = action.high - action.low  # not finite either where both bounds are the type's largest numbers
+    if not np.isfinite(span).all():
         return [
-            f"its action bounds must be finite, got {action}: declare the largest actions that make sense; gymnasium's "
-            "ClipAction takes bounds away, leave it out, as an agent's actions never leave theirs"
+            f"its action bounds must be finite, and so must the distance between them, got {action}: declare the "
+            "largest actions that make sense; gymnasium's ClipAction takes bounds away, leave it out, as an agent's "
+            "actions never leave theirs"
         ]
     return []
 

@@ -11,6 +11,7 @@ from making import make
 from points import Boxed, Dense, Point
 from sb3_tbc.tasks import TASKS
 from sb3_tbc.tasks.generic import DescribedGoalEnv, check_goal_env, describe_goal_env, subgoal_space_of
+from sb3_tbc.tasks.probe import run_probe
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_tbc.zoo.environments import make_env
@@ -375,3 +376,23 @@ def test_observations_that_are_not_finite_are_named():
 
     with pytest.raises(ValueError, match=r"'desired_goal'. of Nan is not finite"):
         describe_goal_env(Nan())
+
+
+@pytest.mark.parametrize("wrong", [np.full(4, np.nan), np.zeros(3)])
+def test_a_bad_step_of_random_episodes_is_left_out(wrong):
+    """What becomes of such steps is for the agent to say (``on_bad_step``)."""
+
+    class Once(Point):
+        always = False
+
+        def step(self, action):
+            seen, *rest = super().step(action)
+            return ({**seen, "observation": wrong} if self.always or self.steps == 7 else seen), *rest
+
+    probe = run_probe(Once(), 100)
+    assert 0 < len(probe.after) < 100
+    assert probe.seen["observation"].shape[1:] == (4,)
+    assert np.isfinite(probe.seen["observation"]).all()
+    Once.always = True
+    with pytest.raises(ValueError, match=r"'observation'. of Once (is not finite|has shape .3,.*) in every step"):
+        run_probe(Once(), 100)
