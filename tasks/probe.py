@@ -93,7 +93,8 @@ def _what_is_wrong(env: Env, observation: GoalObservation, reward: float = 0.0) 
     assert isinstance(env.observation_space, spaces.Dict)
     whose = f"of {type(env.unwrapped).__name__}"
     for key in GOAL_KEYS:
-        shape, given = env.observation_space[key].shape, np.shape(observation.get(key))
+        shape = env.observation_space[key].shape
+        given = np.shape(observation[key]) if key in observation else None
         if given != shape:
             return f"observation[{key!r}] {whose} has shape {given}, not {shape} as its space says,"
         if not np.isfinite(observation[key]).all():
