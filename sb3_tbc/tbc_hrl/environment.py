@@ -18,6 +18,7 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import watch
+from sb3_tbc.smdp.goal_spaces import check_goal_space
 from sb3_tbc.smdp.goal_test import check_goal_test
 from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
 from sb3_tbc.tasks.layouts import layout_cure
@@ -37,6 +38,7 @@ def in_vector(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> Ve
     :param verbose: see SB3
     :param monitor_wrapper: likewise
     :raises TypeError: if it is neither an environment nor a vector
+    :raises ValueError: if an agent cannot reach goals in it, naming every reason
     """
     if not isinstance(env, gym.Env | VecEnv):
         raise TypeError(
@@ -44,6 +46,7 @@ def in_vector(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> Ve
         )
     given = in_goal_vec_env(env) if monitor_wrapper else env
     venv = BaseAlgorithm._wrap_env(given, verbose, monitor_wrapper)
+    check_goal_space(venv.observation_space, venv.action_space)
     watch(venv)
     return with_episode_limit(venv)
 

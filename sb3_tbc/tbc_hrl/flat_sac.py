@@ -23,7 +23,6 @@ from sb3_tbc.reading import read_arrays
 from sb3_tbc.replay.both_levels import MORE
 from sb3_tbc.settings import SettingError, hints
 from sb3_tbc.smdp.episode_limit import with_episode_limit
-from sb3_tbc.smdp.goal_spaces import check_goal_space
 from sb3_tbc.smdp.goal_test import check_goal_test
 from sb3_tbc.smdp.guard import GuardedVecEnv, OnBadStep
 from sb3_tbc.smdp.hindsight import check_goal_strategy
@@ -106,7 +105,6 @@ class FlatSAC(PlainAlgorithm, KeepsLastStep, SAC):
             _init_setup_model=False,
         )
         if self.env is not None:
-            check_goal_space(self.env.observation_space, self.env.action_space)
             refuse_vec_normalize(self.env)
             check_goal_test(self.env, listed_infos=True)
         if sb3._init_setup_model:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from corridor import Corridor
+from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecMonitor
 
 from sb3_tbc import TBCHRL
 from sb3_tbc.tbc_hrl.environment import episode_length
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 
 ID = "sb3_tbc/Pendulum-v0"
 
@@ -48,3 +51,14 @@ def test_fewer_steps_than_decisions_are_no_mistake() -> None:
     model = TBCHRL("MultiInputPolicy", Corridor(max_episode_steps=7), compile=False)
     assert (model.dt_max, model.config.max_options) == (1.0, 20)
     model.learn(30)
+
+
+@pytest.mark.parametrize("algorithm", [TBCHRL, FlatSAC])
+def test_what_no_goal_can_be_reached_in_is_refused_before_sb3_looks_at_it(algorithm: Any) -> None:
+    """SB3 refuses actions without bounds by an assertion that names no cure."""
+    endless = Corridor()
+    endless.action_space = spaces.Box(-np.inf, np.inf, (1,), np.float32)
+    with pytest.raises(ValueError, match="action bounds must be finite"):
+        algorithm("MultiInputPolicy", endless)
+    with pytest.raises(ValueError, match="action bounds must be finite"):
+        algorithm("MultiInputPolicy", Corridor()).set_env(endless)
