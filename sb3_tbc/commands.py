@@ -15,10 +15,13 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError, TrainingError, WriteError
+from sb3_tbc.files import require_writable
 
 FAILED = 1
 USER_MISTAKE = 2
 INTERRUPTED = 130
+MOST_THREADS = 1024
+"""More threads than any machine for this package has cores; torch crashes when it cannot make them all."""
 TOLD = (ConfigError, WriteError, TrainingError, EnvironmentFault, NonFiniteError)
 """Errors whose message is all that a user needs; of others the traceback is shown."""
 
@@ -119,6 +122,8 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
         return FAILED
     except TOLD as error:
         return tell(error, name)
+    except PermissionError as error:
+        return tell(WriteError(f"no permission for {error.filename}; is it yours, or open to you?"), name)
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED
@@ -154,6 +159,39 @@ def add_trust(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def given_path(text: str) -> Path:
+    """A file or folder that the user names; ``~`` is expanded where the shell leaves it, as in ``--json=~/out.json``.
+
+    :raises argparse.ArgumentTypeError: for an empty text, which would mean the working directory, and for a path that
+        the system does not let us look at, or finds too long
+    """
+    if not text:
+        raise argparse.ArgumentTypeError("an empty text names no file or folder; is a variable of the shell unset?")
+    path = Path(os.path.expanduser(text))
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return path  # whether it must be there, the command knows
+    except OSError as error:
+        raise argparse.ArgumentTypeError(f"cannot use {path}: {error.strerror}") from error
+    return path
+
+
+def output_file(text: str) -> Path:
+    """A file that the command is to write; what cannot be written is refused before the work begins.
+
+    :raises argparse.ArgumentTypeError: if so, and for ``-``, which means standard output only where a help text says so
+    """
+    path = given_path(text)
+    if text == "-":
+        raise argparse.ArgumentTypeError("'-' is no name of a file; here the figures go to a file alone")
+    try:
+        require_writable(path)
+    except WriteError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return path
+
+
 def seed_number(text: str) -> int:
     """A seed: a whole number from 0 to 2^32 - 1, as NumPy takes it.
 
@@ -177,6 +215,17 @@ def positive_int(text: str) -> int:
     if not value.is_integer() or value <= 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above zero")
     return int(value)
+
+
+def thread_count(text: str) -> int:
+    """A number of torch threads, of which a process can have only so many.
+
+    :raises argparse.ArgumentTypeError: unless the number lies between 1 and :data:`MOST_THREADS`
+    """
+    value = positive_int(text)
+    if value > MOST_THREADS:
+        raise argparse.ArgumentTypeError(f"{text!r} is more than {MOST_THREADS} threads")
+    return value
 
 
 def not_negative(text: str) -> float:

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch as th
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
+from sb3_tbc.commands import Parser, add_trust, output_file, positive_int, run_command, seed_number, thread_count
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
@@ -28,6 +28,9 @@ EXAMPLES = {
 }
 
 
+STANDARD_OUTPUT = Path("-")
+
+
 def build_parser() -> Parser:
     """The command's arguments."""
     parser = Parser("sb3_tbc.evaluate", EXAMPLES, description=__doc__)
@@ -38,15 +41,22 @@ def build_parser() -> Parser:
     parser.add_argument("--seed", type=seed_number, default=HELD_OUT, help="seed of the episodes; by default one that "
                         "no training and none of its evaluations has used")  # fmt: skip
     parser.add_argument("--stochastic", action="store_true", help="sample actions as in training, instead of the means")
-    parser.add_argument("--json", metavar="OUT", help="write the figures as JSON to this file and to standard output, "
-                        "the summary to standard error; with - to standard output only")  # fmt: skip
-    parser.add_argument("--video", type=Path, metavar="OUT.mp4", help="film episodes with subgoal and remaining time")
+    parser.add_argument("--json", type=_json_output, metavar="OUT", help="write the figures as JSON to this file and to "
+                        "standard output, the summary to standard error; with - to standard output only")  # fmt: skip
+    parser.add_argument(
+        "--video", type=output_file, metavar="OUT.mp4", help="film episodes with subgoal and remaining time"
+    )
     parser.add_argument("--video-episodes", type=positive_int, default=3, help="episodes in the film")
     parser.add_argument("--render", action="store_true", help="show episodes in a window before they are counted")
     add_trust(parser)
     parser.add_argument("--device", default="cpu", help="torch device")
-    parser.add_argument("--num-threads", type=positive_int, default=1, help="torch threads")
+    parser.add_argument("--num-threads", type=thread_count, default=1, help="torch threads")
     return parser
+
+
+def _json_output(text: str) -> Path:
+    """The file for the figures; ``-`` is standard output alone."""
+    return STANDARD_OUTPUT if text == str(STANDARD_OUTPUT) else output_file(text)
 
 
 def identify(path: Path, env: str | None, trust: bool = False) -> Plain:
@@ -145,15 +155,15 @@ def command(argv: Sequence[str]) -> int:
     return 0
 
 
-def _tell(result: PlainMapping, json_out: str | None) -> None:
+def _tell(result: PlainMapping, json_out: Path | None) -> None:
     """Print the summary; with ``--json``, standard output has the JSON alone, the summary goes to standard error."""
     if json_out is None:
         print(describe(result))
         return
     text = to_json(result)
     print(text, end="")
-    if json_out != "-":
-        write_atomic(Path(json_out), text)
+    if json_out != STANDARD_OUTPUT:
+        write_atomic(json_out, text)
         print(describe(result), file=sys.stderr)
 
 

@@ -78,7 +78,9 @@ def _reason(error: OSError) -> str:
     if error.errno in FULL:
         return f"{reason}; make room, then go on"
     if isinstance(error, FileExistsError | NotADirectoryError):
-        return f"{reason}: {error.filename} is a file where a folder is needed"
+        place = Path(str(error.filename))
+        in_the_way = next((path for path in (place, *place.parents) if os.path.isfile(path)), place)
+        return f"{reason}: {in_the_way} is a file where a folder is needed"
     return f"{reason}; is the folder yours and writable?"
 
 
@@ -98,8 +100,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     with explained(path):
         path = Path(os.path.realpath(path)) if path.is_symlink() else path
-        if path.is_dir():
-            raise WriteError(f"cannot write {path}: it is a folder; name a file, e.g. one in it")
+        _require_file(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = temporary_beside(path)
         try:
@@ -110,6 +111,25 @@ def replacing(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
             raise
         sync(path.parent)
+
+
+def require_writable(path: Path) -> None:
+    """Refuse a file that cannot be written, before the minutes of work that it is to hold. Nothing is made.
+
+    :raises WriteError: if it is a folder, or there is no folder for it and none can be made
+    """
+    with explained(path):
+        _require_file(path)
+        folder = next(parent for parent in Path(os.path.realpath(path)).parents if parent.exists())
+        if not folder.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR), str(folder))
+        if not os.access(folder, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(folder))
+
+
+def _require_file(path: Path) -> None:
+    if path.is_dir():
+        raise WriteError(f"cannot write {path}: it is a folder; name a file, e.g. one in it")
 
 
 def write_atomic(path: Path, text: str) -> None:

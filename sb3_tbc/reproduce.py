@@ -23,6 +23,7 @@ from sb3_tbc.commands import (
     INTERRUPTED,
     Parser,
     Several,
+    given_path,
     positive_int,
     run_command,
     seed_number,
@@ -91,8 +92,8 @@ def build_parser() -> Parser:
         "names them, e.g. slurm_partition:short timeout_min:600")  # fmt: skip
     add("--address", help="address of the Ray cluster; by default RAY_ADDRESS, or a new cluster on this machine")
     add("--dry-run", action="store_true", help="print what would be run and how long it takes, and stop")
-    add("--log-folder", type=Path, default=Path("runs"), help="folder of the runs")
-    add("--ledger", type=Path, default=Path("results"), help="folder that the small result files are copied to")
+    add("--log-folder", type=given_path, default=Path("runs"), help="folder of the runs")
+    add("--ledger", type=given_path, default=Path("results"), help="folder that the small result files are copied to")
     return parser
 
 

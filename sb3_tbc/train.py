@@ -18,11 +18,13 @@ from sb3_tbc.commands import (
     Parser,
     Several,
     add_trust,
+    given_path,
     not_negative,
     positive_int,
     python,
     run_command,
     seed_number,
+    thread_count,
 )
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
@@ -76,8 +78,8 @@ def build_parser() -> Parser:
     what.add_argument("--config", metavar="{paper,tuned,FILE.yml}", help="paper: the values of the paper's tables; "
                       "tuned: values that did better in measurements, the default for tasks that have them; or a file "
                       "with sections like those of zoo_configs")  # fmt: skip
-    what.add_argument("--config-file", type=Path, metavar="FILE.yml", help="a configuration file of your own; --config "
-                      "says which of its values to use, paper or tuned")  # fmt: skip
+    what.add_argument("--config-file", type=given_path, metavar="FILE.yml", help="a configuration file of your "
+                      "own; --config says which of its values to use, paper or tuned")  # fmt: skip
     what.add_argument("--ablation", metavar="NAME", help="leave a part of the method out (no-ts: timed windows, "
                       f"no-ndbc: the circuit), or put one in (with-...): {', '.join(ABLATIONS)}")  # fmt: skip
     what.add_argument("--hyperparams", action=Several, default=[], metavar="NAME:VALUE", help="single settings, which "
@@ -92,14 +94,16 @@ def build_parser() -> Parser:
                        help="episodes of each evaluation")  # fmt: skip
     watch.add_argument("--n-final-episodes", type=positive_int, default=100, help="episodes of the last evaluation")
     where = parser.add_argument_group("where it is kept")
-    where.add_argument("--log-folder", type=Path, default=Path("runs"),
+    where.add_argument("--log-folder", type=given_path, default=Path("runs"),
                        help="the run goes to <log-folder>/<task>/<algo>/<variant>/seed_<n>")  # fmt: skip
     where.add_argument("--variant", help="name of the run's folder; by default full (the shipped settings), "
                        "custom (others) or the ablation; --config paper adds -paper")  # fmt: skip
     where.add_argument("--overwrite", action="store_true", help="replace an earlier run in the same folder")
-    where.add_argument("--resume", type=Path, metavar="RUN", help="continue the run in this folder as it was begun; "
-                       "--n-timesteps may extend it")  # fmt: skip
-    where.add_argument("--ledger", type=Path, metavar="FOLDER", help="also copy the small result files here at the end")
+    where.add_argument("--resume", type=given_path, metavar="RUN", help="continue the run in this folder as it "
+                       "was begun; --n-timesteps may extend it")  # fmt: skip
+    where.add_argument(
+        "--ledger", type=given_path, metavar="FOLDER", help="also copy the small result files here at the end"
+    )
     where.add_argument("--trace", action="store_true", help="write every option of training to options.csv, which the "
                        "report draws")  # fmt: skip
     where.add_argument("--tensorboard", action="store_true", help="write TensorBoard files into the run's folder")
@@ -109,7 +113,7 @@ def build_parser() -> Parser:
                        "that --resume can extend it; remembered")  # fmt: skip
     machine = parser.add_argument_group("machine")
     machine.add_argument("--device", default="cpu", help="torch device; agents of two levels learn on the CPU alone")
-    machine.add_argument("--num-threads", type=positive_int, default=1,
+    machine.add_argument("--num-threads", type=thread_count, default=1,
                          help="torch threads; more than one is slower on networks this small")  # fmt: skip
     machine.add_argument("--progress", action=argparse.BooleanOptionalAction,
                          help="progress bar; by default on a terminal")  # fmt: skip

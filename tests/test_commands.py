@@ -17,7 +17,7 @@ from test_cli import said
 
 from sb3_tbc import __main__, evaluate, train
 from sb3_tbc.benchmark import command as benchmark
-from sb3_tbc.commands import COMMANDS, Parser, python
+from sb3_tbc.commands import COMMANDS, Parser, given_path, output_file, python, run_command, thread_count
 from sb3_tbc.export import command as export
 from sb3_tbc.extras import MissingExtraError, require
 from sb3_tbc.ndbc.wiring import NDBCWiring
@@ -294,6 +294,41 @@ def test_names_of_files_are_refused_before_the_work(tmp_path: Path, capsys: pyte
         assert export(["pretrained:Pendulum", "--format", kind, "--output", str(tmp_path / name)]) == 2
         assert f"--format {kind} writes a file that ends in {suffix}, got --output" in said(capsys)
     assert list(tmp_path.iterdir()) == []
+
+
+BROKEN = [("", "an empty text names no file"), ("-", "no name of a file"), (".", "it is a folder"),
+          ("file/out.json", "file is a file where a folder is needed")]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "why"), BROKEN)
+@pytest.mark.parametrize("command", [["interpret", "pretrained:Pendulum"], ["benchmark", "parameters"]])
+def test_outputs_that_cannot_be_written_are_refused_before_the_work(
+    command: list[str], name: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(SystemExit) as stop:
+        import_module(COMMANDS[command[0]].module).main([*command[1:], "--json", name])
+    assert stop.value.code == 2
+    assert why in said(capsys)
+
+
+def test_paths_begin_at_home_and_can_be_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert output_file("~/new/out.json") == tmp_path / "new" / "out.json"
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(argparse.ArgumentTypeError, match=r"cannot use xxx.*too long"):
+        given_path("x" * 300)
+    with pytest.raises(argparse.ArgumentTypeError, match="more than 1024 threads"):
+        thread_count("1e8")
+
+
+def test_a_place_without_permission_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    def refused(argv: object) -> int:
+        raise PermissionError(13, "Permission denied", "/there/config.yml")
+
+    assert run_command(refused, "sb3_tbc.train", []) == 2
+    assert said(capsys) == "sb3_tbc.train: error: no permission for /there/config.yml; is it yours, or open to you?"
 
 
 def test_what_to_type_next_names_this_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

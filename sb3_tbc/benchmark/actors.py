@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -93,9 +94,9 @@ def parse_actor(text: str) -> Actor:
         return Actor(text, lambda skill, seed: conditioned(skill, seed, values), rates or CIRCUIT_RATES, factors,
                      optimizer)  # fmt: skip
     plain = not options and not factors
-    if name == "mlp" and plain and all(w.isdigit() and int(w) > 0 for w in size.split("x") if size):
+    if name == "mlp" and plain and all(w.isdecimal() and int(w) > 0 for w in size.split("x") if size):
         return Actor(text, lambda skill, seed: _make_mlp(skill, seed, size), rates or MLP_RATES, {}, optimizer)
-    if name == "gru" and plain and size.isdigit() and int(size) > 0:
+    if name == "gru" and plain and size.isdecimal() and int(size) > 0:
         return Actor(text, lambda skill, seed: _make_gru(skill, seed, int(size)), rates or MLP_RATES, {}, optimizer)
     raise ConfigError(f"no actor {text!r}: give paper or lean, mlp, mlp:24x14, mlp:1300 or gru:16, see --help")
 
@@ -105,8 +106,8 @@ def _number(value: str, text: str) -> float:
         number = float(value)
     except ValueError:
         number = -1.0
-    if not number > 0:
-        raise ConfigError(f"actor {text!r}: a rate is a number above 0, got {value!r}")
+    if not 0 < number < math.inf:
+        raise ConfigError(f"actor {text!r}: a rate is a finite number above 0, got {value!r}")
     return number
 
 
@@ -116,7 +117,7 @@ def _circuit_option(option: str, text: str) -> tuple[str, object]:
         return SWITCHES[option]
     if key not in (*WIRING_NUMBERS, "sub_steps", "readout") or not value:
         raise ConfigError(f"unknown option {option!r} of actor {text!r}; there are {', '.join(SWITCHES)}")
-    return key, int(value) if value.isdigit() else value
+    return key, int(value) if value.isdecimal() else value
 
 
 def conditioned(skill: Skill, seed: int, values: PlainMapping) -> nn.Module:
@@ -195,6 +196,10 @@ def equal_widths(skill: Skill, parameters: int) -> tuple[int, int]:
     def size(a: int, b: int) -> int:
         return (skill.n_inputs + 1) * a + (a + 1) * b + (b + 1) * skill.n_outputs
 
+    if parameters > (most := size(MAX_WIDTH, MAX_WIDTH)):
+        raise ConfigError(
+            f"an MLP of {parameters} parameters is too large, {most} are possible; give widths, mlp:64x64"
+        )
     pairs = ((a, b) for a in range(1, MAX_WIDTH) for b in range(max(1, a // 2), 2 * a + 1))
     return min(itertools.takewhile(lambda p: size(p[0], 1) < 2 * parameters + 1000, pairs),
                key=lambda p: abs(size(*p) - parameters))  # fmt: skip

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import Parser, Several, add_trust, positive_int, run_command, seed_number
+from sb3_tbc.commands import Parser, Several, add_trust, output_file, positive_int, run_command, seed_number
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
@@ -26,6 +25,7 @@ EXAMPLES = {
     "sb3_tbc.benchmark robustness pretrained:Pendulum": "a trained agent under noise, late actions and other physics",
 }
 JSON_HELP = "write the figures to this file, too"
+ENV_HELP = "task; by default the one on which the agent was trained"
 
 
 def build_parser() -> Parser:
@@ -35,7 +35,7 @@ def build_parser() -> Parser:
     commands = parser.add_subparsers(dest="subject", required=True, parser_class=Parser)
     _add_cells(commands)
     parameters = commands.add_parser("parameters", help="sizes of table A1's and the shipped circuits, beside MLPs")
-    parameters.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    parameters.add_argument("--json", type=output_file, metavar="OUT", help=JSON_HELP)
     _add_train(commands)
     _add_fit(commands)
     _add_robustness(commands)
@@ -49,7 +49,7 @@ def _add_cells(commands: Commands) -> None:
     cells.add_argument("--time", type=positive_int, default=16, help="steps of a sequence")
     cells.add_argument("--compile", action="store_true", help="also the compiled network (takes minutes to compile)")
     cells.add_argument("--no-growth", action="store_true", help="skip the curves over synapses, time and K")
-    cells.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    cells.add_argument("--json", type=output_file, metavar="OUT", help=JSON_HELP)
 
 
 def _add_fit(commands: Commands) -> None:
@@ -71,13 +71,16 @@ def _add_fit(commands: Commands) -> None:
     fit.add_argument(
         "--seeds", type=positive_int, default=1, help="number of seeds per actor; figures are means over them"
     )
-    fit.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    fit.add_argument("--json", type=output_file, metavar="OUT", help=JSON_HELP)
     record = commands.add_parser("record", help="record the low level of a trained agent as a skill for fit")
     record.add_argument("model", type=model_path, metavar="MODEL.zip", help="an agent whose low level has no memory; "
                         "pretrained:TASK is one that comes with the package")  # fmt: skip
-    record.add_argument("--out", metavar="OUT.npz", help="by default the task's file among the package's skills")
+    record.add_argument(
+        "--out", type=output_file, metavar="OUT.npz", help="by default the task's file among the package's skills"
+    )
+    record.add_argument("--env", help=ENV_HELP)
     record.add_argument("--every", type=positive_int, default=3, help="record every N-th step", metavar="N")
-    record.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    record.add_argument("--json", type=output_file, metavar="OUT", help=JSON_HELP)
     add_trust(record)
 
 
@@ -85,9 +88,10 @@ def _add_robustness(commands: Commands) -> None:
     robustness = commands.add_parser("robustness", help="agents under noise, late actions and changed physics")
     robustness.add_argument("models", nargs="+", type=model_path, metavar="MODEL.zip", help="agents of one task, shown "
                             "side by side; pretrained:TASK is one that comes with the package")  # fmt: skip
+    robustness.add_argument("--env", help=ENV_HELP)
     robustness.add_argument("--n-episodes", type=positive_int, default=100, help="episodes under each disturbance")
     robustness.add_argument("--seed", type=seed_number, default=0, help="seed of the episodes")
-    robustness.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    robustness.add_argument("--json", type=output_file, metavar="OUT", help=JSON_HELP)
     add_trust(robustness)
 
 
@@ -104,7 +108,7 @@ def _add_train(commands: Commands) -> None:
                        "configuration's")  # fmt: skip
     train.add_argument("--steps", type=positive_int, default=2000, help="environment steps of one measurement")
     train.add_argument("--rounds", type=positive_int, default=5, help="measurements of each contender, in turns")
-    train.add_argument("--json", metavar="OUT", help=JSON_HELP)
+    train.add_argument("--json", type=output_file, metavar="OUT", help=JSON_HELP)
 
 
 def benchmark(argv: Sequence[str]) -> int:
@@ -112,8 +116,8 @@ def benchmark(argv: Sequence[str]) -> int:
     arguments = build_parser().parse_args(argv)
     lines, figures = _measure(arguments)
     print("\n".join(lines))
-    if arguments.json:
-        write_atomic(Path(arguments.json), to_json(figures))
+    if arguments.json is not None:
+        write_atomic(arguments.json, to_json(figures))
     return 0
 
 
@@ -145,8 +149,7 @@ def _measure(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
 def _record(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
     from sb3_tbc.benchmark.skills import record_file
 
-    out = Path(arguments.out) if arguments.out else None
-    written = record_file(Path(arguments.model), out, arguments.every, arguments.trust)
+    written = record_file(arguments.model, arguments.out, arguments.every, arguments.env, arguments.trust)
     return [f"recording      {written} ({written.stat().st_size / 1e6:.2f} MB)"], {"recording": str(written)}
 
 

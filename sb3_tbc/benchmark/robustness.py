@@ -18,12 +18,13 @@ import numpy as np
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.evaluate import identify
 from sb3_tbc.settings import merge
 from sb3_tbc.smdp.options import Episode
 from sb3_tbc.stats import wilson_interval
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.tbc_hrl.tbc_hrl import TBCHRL
-from sb3_tbc.zoo.algorithms import environment_of, load_model, read_zip
+from sb3_tbc.zoo.algorithms import load_two_levels
 from sb3_tbc.zoo.environments import NAMESPACE, make_env
 from sb3_tbc.zoo.runner import evaluation_envs
 
@@ -82,18 +83,18 @@ def episodes_under(model: TBCHRL, env_id: str, env_kwargs: Mapping[str, object],
         venv.close()
 
 
-def measure(path: Path, n_episodes: int, seed: int, trust: bool = False) -> list[Robustness]:
+def measure(path: Path, n_episodes: int, seed: int, env_id: str | None = None, trust: bool = False) -> list[Robustness]:
     """One agent under every disturbance of its task.
 
     :param path: the agent's ``.zip``
+    :param env_id: the task, by default the one on which the agent was trained
     :raises ConfigError: for an agent of one level, and for a task that cannot be disturbed
     """
-    env_id, env_kwargs = environment_of(path, read_zip(path), trust)
+    info = identify(path, env_id, trust)
+    env_id, env_kwargs = str(info["env_id"]), info["env_kwargs"]
     if not env_id.startswith(NAMESPACE):
         raise ConfigError(f"{path} acts in {env_id}; only this package's tasks can be disturbed")
-    model = load_model(path, trust=trust)
-    if not isinstance(model, TBCHRL):
-        raise ConfigError(f"{path} is an agent of one level; robustness compares agents of two (tbc-hrl, hits, hac)")
+    model = load_two_levels(path, trust=trust)
     env = make_env(env_id, **env_kwargs)
     names: tuple[str, ...] = env.unwrapped.dynamics_names  # type: ignore[attr-defined]
     env.close()
@@ -111,10 +112,12 @@ def robustness(arguments: argparse.Namespace) -> tuple[list[str], Plain]:
 
     :raises ConfigError: if two agents were trained on different tasks
     """
-    given = [environment_of(Path(m), read_zip(Path(m)), arguments.trust)[0] for m in arguments.models]
+    given = [identify(path, arguments.env, arguments.trust)["env_id"] for path in arguments.models]
     if len(set(given)) > 1:
         raise ConfigError(f"agents of different tasks cannot be compared, got {', '.join(given)}")
-    tables = [measure(Path(m), arguments.n_episodes, arguments.seed, arguments.trust) for m in arguments.models]
+    tables = [
+        measure(path, arguments.n_episodes, arguments.seed, arguments.env, arguments.trust) for path in arguments.models
+    ]
     lines = [f"agent {i}: {table[0].agent}" for i, table in enumerate(tables)]
     head = "".join(f"{f'success {i}':>11}{f'95 % Wilson {i}':>15}{f'rough {i}':>9}" for i in range(len(tables)))
     lines.append(f"{'disturbance':<20}{head}")

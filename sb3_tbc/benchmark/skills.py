@@ -13,10 +13,11 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.arrays import FloatArray
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.files import replacing
+from sb3_tbc.evaluate import identify
+from sb3_tbc.files import replacing, require_writable
 from sb3_tbc.tbc_hrl import TBCHRL
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
-from sb3_tbc.zoo.algorithms import RUN_INFO, load_two_levels, read_zip
+from sb3_tbc.zoo.algorithms import load_two_levels
 from sb3_tbc.zoo.environments import make_envs, resolve_env
 
 MAX_BYTES = 900_000
@@ -60,10 +61,13 @@ def load_skill(name: str) -> Skill:
     :param name: a task that has a recording, or ``delay<steps>``
     :raises ConfigError: if there is none of this name
     """
-    if name.startswith("delay") and name[5:].isdigit() and 0 < int(name[5:]) < DELAY_STEPS:
-        return delay_skill(int(name[5:]))
+    delay = name.removeprefix("delay")
+    if delay != name and delay.isdecimal() and 0 < int(delay) < DELAY_STEPS:
+        return delay_skill(int(delay))
     if name not in skill_names():
-        raise ConfigError(f"no skill {name!r}; there are {', '.join(skill_names())}, and delay<steps> for any delay")
+        raise ConfigError(
+            f"no skill {name!r}; there are {', '.join(skill_names())}, and delay1 to delay{DELAY_STEPS - 1}"
+        )
     data = (files("sb3_tbc.benchmark") / "skills" / f"{name}.npz").read_bytes()
     with np.load(io.BytesIO(data)) as recording:
         inputs, means = (th.from_numpy(recording[key].astype(np.float32)) for key in ("inputs", "means"))
@@ -127,24 +131,25 @@ def record(model: TBCHRL, env: VecEnv, every: int = 3, seed: int = 0) -> dict[st
     return {**half, "learnt": np.array(learnt)}
 
 
-def record_file(path: Path, out: Path | None, every: int, trust: bool = False) -> Path:
-    """Record the agent in a ``.zip`` on the task on which it was trained.
+def record_file(path: Path, out: Path | None, every: int, env: str | None = None, trust: bool = False) -> Path:
+    """Record the agent in a ``.zip`` on its task.
 
     :param path: the agent
     :param out: where to write; by default where the skills of this package lie, under the task's name
     :param every: see :func:`record`
+    :param env: the task, by default the one on which the agent was trained
     :param trust: whether the file may run code
     :return: the file written
-    :raises ConfigError: if the agent's file does not name its task
+    :raises ConfigError: if the agent cannot be loaded, or its file does not name its task
     """
-    info = read_zip(path).get(RUN_INFO)
-    if info is None:
-        raise ConfigError(f"{path} does not say on which environment it was trained; train with sb3_tbc.train")
-    env = make_envs(info["env_id"], 1, 0, info["env_kwargs"])
-    recording = record(load_two_levels(path, trust=trust), env, every)
-    env.close()
+    info = identify(path, env, trust)
+    model = load_two_levels(path, trust=trust)
+    venv = make_envs(info["env_id"], 1, 0, info["env_kwargs"])
     task, _ = resolve_env(info["env_id"])
     out = out or Path(str(files("sb3_tbc.benchmark") / "skills")) / f"{task}.npz"
+    require_writable(out)  # recording takes minutes
+    recording = record(model, venv, every)
+    venv.close()
     with replacing(out) as temporary:
         buffer = io.BytesIO()
         np.savez_compressed(buffer, **recording)  # type: ignore[arg-type]

@@ -354,9 +354,12 @@ def budget(task: str, steps: int, rounds: int, config: str | None = None) -> Res
 
 def train(arguments: argparse.Namespace) -> Result:
     """Measure what the arguments ask for; lines to print, and the figures."""
+    steps, rounds, config = arguments.steps, arguments.rounds, arguments.config
     unknown = [what for what in arguments.what if what not in WHAT]
     if unknown:
         raise ConfigError(f"no measurement {unknown[0]!r}; there are {', '.join(WHAT)}")
+    for task in arguments.tasks:  # before the minutes that the first of them may take
+        make_envs(resolve_env(task)[1], 1, 0, load_config("tbc-hrl", task, config).env_kwargs).close()
     one_core()
     lines: list[str] = ["one core, one thread, CPU time unless said; medians of rounds in turns"]
     figures: Figures = {}
@@ -366,7 +369,6 @@ def train(arguments: argparse.Namespace) -> Result:
         more, figures[name] = measure()
         lines.extend(["", *more])
 
-    steps, rounds, config = arguments.steps, arguments.rounds, arguments.config
     if "update" in arguments.what:
         keep("update", lambda: update(rounds))
     measurements: dict[str, Callable[..., Result]] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
+from sb3_tbc.commands import Parser, add_trust, output_file, positive_int, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.export.policy import MLP, Circuit, ExportedPolicy, extract
 from sb3_tbc.export.rounding import rounded
@@ -38,7 +38,9 @@ def build_parser() -> Parser:
     parser.add_argument("--weights", choices=["float32", "int8"], default="float32", help="int8 rounds the low level's "
                         "weights to eight bits: C files then need a quarter of the flash for them; the other formats "
                         "compute with the same rounded weights")  # fmt: skip
-    parser.add_argument("--output", type=Path, help="file to write; by default beside the model, with another suffix")
+    parser.add_argument(
+        "--output", type=output_file, help="file to write; by default beside the model, with another suffix"
+    )
     parser.add_argument("--check", type=positive_int, metavar="STEPS", help="act for this many steps with the agent "
                         "and with the exported policy, and print how much their actions differ")  # fmt: skip
     parser.add_argument("--env", help="environment for --check; by default the task on which the agent was trained")

@@ -10,7 +10,7 @@ from pathlib import Path
 import torch as th
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import Parser, add_trust, positive_int, run_command, seed_number
+from sb3_tbc.commands import Parser, add_trust, output_file, positive_int, run_command, seed_number, thread_count
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.evaluate import identify
 from sb3_tbc.export.policy import extract
@@ -48,18 +48,20 @@ def build_parser() -> Parser:
     parser.add_argument("--env", help="task or goal environment id; by default the one the agent was trained on")
     parser.add_argument("--n-episodes", type=positive_int, default=20, help="held-out episodes")
     parser.add_argument("--seed", type=seed_number, default=HELD_OUT, help="seed of the first episode")
-    parser.add_argument("--json", type=Path, metavar="OUT.json", help="write every figure")
-    parser.add_argument("--png", type=Path, metavar="OUT.png", help="draw activation in space, as the paper's figure 5")
-    parser.add_argument("--wiring", type=Path, metavar="OUT.png", help="draw the circuit: its readout, dead ends, and "
-                        "synapses as thick as they are used")  # fmt: skip
-    parser.add_argument("--html", type=Path, metavar="OUT.html", help="write a page in which the circuit runs, in one "
-                        "file")  # fmt: skip
+    parser.add_argument("--json", type=output_file, metavar="OUT.json", help="write every figure")
+    parser.add_argument(
+        "--png", type=output_file, metavar="OUT.png", help="draw activation in space, as the paper's figure 5"
+    )
+    parser.add_argument("--wiring", type=output_file, metavar="OUT.png", help="draw the circuit: its readout, dead "
+                        "ends, and synapses as thick as they are used")  # fmt: skip
+    parser.add_argument("--html", type=output_file, metavar="OUT.html", help="write a page in which the circuit runs, "
+                        "in one file")  # fmt: skip
     parser.add_argument("--n-random", type=positive_int, default=5, help="random lesions of each size")
     parser.add_argument("--max-alone", type=positive_int, default=24, help="units lesioned one by one, the most "
                         "active ones first")  # fmt: skip
     parser.add_argument("--synapses", action="store_true", help="also remove each synapse, one at a time (slow)")
     parser.add_argument("--device", default="cpu", help="torch device")
-    parser.add_argument("--num-threads", type=positive_int, default=1, help="torch threads")
+    parser.add_argument("--num-threads", type=thread_count, default=1, help="torch threads")
     add_trust(parser)
     return parser
 

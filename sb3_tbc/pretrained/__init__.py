@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_tbc.commands import given_path
 from sb3_tbc.errors import ConfigError, nearest
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ def pretrained_path(name: str) -> Path:
     """
     names = pretrained_names()
     if name not in names:
-        raise ConfigError(f"no trained agent {name!r} comes with the package; {nearest(name, names)}")
+        raise ConfigError(f"no trained agent {name!r} comes with the package; {nearest(str(name), names)}")
     return FOLDER / f"{name}.zip"
 
 
@@ -53,10 +54,10 @@ def is_pretrained(path: Path) -> bool:
 def model_path(text: str) -> Path:
     """A command's ``MODEL`` argument: a path, or ``pretrained:TASK`` for an agent that comes with the package.
 
-    :raises argparse.ArgumentTypeError: if there is no such agent
+    :raises argparse.ArgumentTypeError: if there is no such agent, or the text is empty
     """
     if not text.startswith(PREFIX):
-        return Path(text)
+        return given_path(text)
     try:
         return pretrained_path(text.removeprefix(PREFIX))
     except ConfigError as error:

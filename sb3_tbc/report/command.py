@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sb3_tbc.commands import Parser, run_command
+from sb3_tbc.commands import Parser, given_path, output_file, run_command
 from sb3_tbc.files import write_atomic
 from sb3_tbc.report.markdown import curves_csv, to_markdown, update_page
 from sb3_tbc.report.measured import measured_yaml
@@ -23,14 +23,16 @@ EXAMPLES = {
 def build_parser() -> Parser:
     """The command's arguments."""
     parser = Parser("sb3_tbc.report", EXAMPLES, description=__doc__)
-    parser.add_argument("results", nargs="?", type=Path, default=Path("results"),
+    parser.add_argument("results", nargs="?", type=given_path, default=Path("results"),
                         help="folder of runs, or the ledger; by default results")  # fmt: skip
-    parser.add_argument("--html", type=Path, metavar="OUT", help="write a page that needs no other file; films that "
-                        "lie beside it or in the runs' folders are linked")  # fmt: skip
-    parser.add_argument("--update", type=Path, metavar="PAGE.md", help="write all tables into this page, between its "
-                        "result marks")  # fmt: skip
-    parser.add_argument("--curves", type=Path, metavar="OUT.csv", help="write all learning curves as one table")
-    parser.add_argument("--measured", type=Path, metavar="OUT.yml", help="write the minutes that train --list prints")
+    parser.add_argument("--html", type=output_file, metavar="OUT", help="write a page that needs no other file; "
+                        "films that lie beside it or in the runs' folders are linked")  # fmt: skip
+    parser.add_argument("--update", type=given_path, metavar="PAGE.md", help="write all tables into this page, "
+                        "between its result marks")  # fmt: skip
+    parser.add_argument("--curves", type=output_file, metavar="OUT.csv", help="write all learning curves as one table")
+    parser.add_argument(
+        "--measured", type=output_file, metavar="OUT.yml", help="write the minutes that train --list prints"
+    )
     return parser
 
 

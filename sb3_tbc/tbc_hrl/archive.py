@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
+import os
 import re
 import zipfile
 from pathlib import Path
+
+from stable_baselines3.common.save_util import json_to_data
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.errors import ConfigError
@@ -14,6 +18,7 @@ from sb3_tbc.outside import one_line
 from sb3_tbc.tbc_hrl.plain import NotPlainError, decode
 
 DATA, PLAIN_DATA = "data", "plain.json"
+POLICY = "policy_class"
 PICKLED = ":serialized:"
 """Key of SB3 in ``data``: what lies under it is unpickled by SB3's own loading."""
 MAX_MEMBERS = 200
@@ -33,12 +38,17 @@ def read_bytes(path: str | Path | io.BufferedIOBase) -> bytes:
     """The whole file; as in SB3, the ending ``.zip`` may be left out.
 
     :raises ConfigError: if it is missing or cannot be read
+    :raises TypeError: if it is neither a path nor an open file
     """
-    if not isinstance(path, str | Path):
+    if hasattr(path, "read") and hasattr(path, "seek"):
         path.seek(0)  # as SB3 does not mind where writing has left it
         return path.read()
+    if not isinstance(path, str | Path):
+        raise TypeError(
+            f"an agent is loaded from the path of its .zip, or from an open file, got {one_line(repr(path))}"
+        )
     given = Path(path)
-    file = given if given.suffix or given.is_file() else given.with_suffix(".zip")
+    file = given if given.suffix or os.path.isfile(given) or not given.name else given.with_suffix(".zip")
     try:
         return file.read_bytes()
     except FileNotFoundError as error:
@@ -110,6 +120,21 @@ def _table(archive: zipfile.ZipFile, member: str, name: str) -> Plain:
 def pickled_keys(data: Plain) -> list[str]:
     """The entries of ``data`` that SB3 would unpickle."""
     return [key for key, value in data.items() if isinstance(value, dict) and PICKLED in value]
+
+
+def policy_of(data: Plain, trust: bool) -> object:
+    """The class of the saved policy, or the name of its module if only unpickling could tell the class.
+
+    :param data: as :func:`read_data` gave it
+    :param trust: whether it may be unpickled
+    """
+    entry, plain = data.get(POLICY), data.get(PLAIN_DATA, {})
+    if POLICY in plain:
+        with contextlib.suppress(NotPlainError, RecursionError):
+            return decode(plain[POLICY])
+    if trust:
+        return json_to_data(json.dumps({POLICY: entry}))[POLICY]
+    return entry.get("__module__") if isinstance(entry, dict) else None
 
 
 def unpickled(data: Plain, name: str, given: Plain, has_env: bool) -> Plain:

@@ -22,6 +22,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.settings import Range, SettingError, Settings, default_of, hints
 from sb3_tbc.smdp.spaces import SubgoalSpace
+from sb3_tbc.tbc_hrl.checks import device_type
 from sb3_tbc.tbc_hrl.config import AgentConfig, FlatConfig
 from sb3_tbc.tbc_hrl.level_config import HighConfig, LowConfig
 
@@ -53,13 +54,7 @@ class SB3Arguments(Settings):
         """
         if self.device == "auto":
             return
-        try:
-            kind = th.device(self.device).type
-        except RuntimeError:
-            raise SettingError(
-                "device", f"must be 'auto', 'cpu', 'cuda' or 'cuda:<number>', got {self.device!r}"
-            ) from None
-        if kind == "cuda" and not th.cuda.is_available():
+        if device_type(self.device) == "cuda" and not th.cuda.is_available():
             raise SettingError(
                 "device", f"{str(self.device)!r} needs a GPU, and torch finds none on this machine; use device='cpu'"
             )

@@ -68,11 +68,26 @@ def check_sizes(space: spaces.Dict, batch: Arrays) -> None:
         raise ValueError(f"the parts of an observation must be of the same environments, got {shapes}")
 
 
+def device_type(device: th.device | str) -> str:
+    """The kind of a torch device, ``cpu`` or ``cuda``.
+
+    :raises SettingError: for one that torch does not know
+    """
+    try:
+        return th.device(device).type
+    except (RuntimeError, TypeError):
+        raise SettingError("device", f"must be 'auto', 'cpu', 'cuda' or 'cuda:<number>', got {device!r}") from None
+
+
 def device_here(device: th.device | str) -> th.device | str:
     """Where to load an agent: the CPU, with a warning, if a GPU is asked for that torch does not find.
 
     SB3 does so silently; agents trained on a GPU must load on machines without one.
+
+    :raises SettingError: for a device that torch does not know
     """
+    if device != "auto":
+        device_type(device)
     if str(device).startswith("cuda") and not th.cuda.is_available():
         warnings.warn(f"device {str(device)!r} is not there: the agent is loaded on the CPU", stacklevel=3)
         return "cpu"

@@ -21,7 +21,7 @@ from sb3_tbc.files import save_atomic
 from sb3_tbc.settings import SettingError, Settings, hints, plain
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import named_reset
-from sb3_tbc.tbc_hrl.archive import pickled_keys, read_bytes, read_data, unpickled, with_plain
+from sb3_tbc.tbc_hrl.archive import pickled_keys, policy_of, read_bytes, read_data, unpickled, with_plain
 from sb3_tbc.tbc_hrl.checks import device_here, without_sb3_names
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
 
@@ -35,6 +35,8 @@ TEMPERATURE = ("ent_coef_optimizer", "log_ent_coef", "ent_coef_tensor")
 """Where SB3's SAC keeps what an ``ent_coef`` has become."""
 SHAPES = frozenset({"duration", "window_end", "remaining_time", "critic_norm", "policy_kwargs", "subgoals"})
 """Settings, or sections of them, that shape the networks."""
+LIBRARIES = ("stable_baselines3.", "sb3_contrib.", "sbx.")
+"""Modules below these are not a user's own."""
 UNFIT = (
     "cannot be changed when an agent is loaded: the saved weights do not fit the networks it would have; leave it out, "
     "or train a new agent"
@@ -70,7 +72,7 @@ class PlainAlgorithm(BaseAlgorithm):
             path.write(content)
             return
         target = pathlib.Path(path)
-        target = target if target.suffix else target.with_suffix(".zip")
+        target = target if target.suffix or not target.name else target.with_suffix(".zip")
         save_atomic(lambda name: pathlib.Path(name).write_bytes(content), target)
 
     def set_parameters(
@@ -128,15 +130,20 @@ class PlainAlgorithm(BaseAlgorithm):
     def _check_policy(cls, policy: object, name: str) -> None:
         """Refuse an agent of another algorithm, whose policy this one cannot hold.
 
-        :param policy: the class of the saved policy; anything else if it is not known before it is unpickled
+        :param policy: the class of the saved policy, or the name of its module if it is known only when unpickled
         :param name: of the file
         :raises ConfigError: if it is no policy of this algorithm
         """
         own = tuple(cls.policy_aliases.values())
-        if isinstance(policy, type) and not issubclass(policy, own):
+        if isinstance(policy, type):
+            kind = "" if issubclass(policy, own) else f"a {policy.__name__}"
+        else:
+            known = str(policy).startswith(LIBRARIES) and str(policy) not in {alias.__module__ for alias in own}
+            kind = f"from {policy}" if known else ""
+        if kind:
             raise ConfigError(
-                f"{name} holds an agent whose policy is a {policy.__name__}, where {cls.__name__} has a "
-                f"{own[0].__name__}: load it with the class that saved it"
+                f"{name} holds an agent whose policy is {kind}, where {cls.__name__} has a {own[0].__name__}: load it "
+                "with the class that saved it"
             )
 
     @classmethod
@@ -169,8 +176,8 @@ class PlainAlgorithm(BaseAlgorithm):
         name = str(path) if isinstance(path, str | pathlib.Path) else "the agent"
         content = read_bytes(path)
         data, given = read_data(content, name), dict(custom_objects or {})
+        cls._check_policy(given.get("policy_class", policy_of(data, trust)), name)
         values = {} if trust else unpickled(data, name, given, env is not None)
-        cls._check_policy({**values, **given}.get("policy_class"), name)
         changes = cls._changes(kwargs, data)
         now, later = parted(changes)
         try:
@@ -179,9 +186,13 @@ class PlainAlgorithm(BaseAlgorithm):
             )
             model._change_parts(later)
         except RuntimeError as error:
-            if not changes or "state_dict" not in str(error):  # torch's word for weights that do not fit
+            if "state_dict" not in str(error):  # torch's word for weights that do not fit
                 raise
-            raise SettingError(named(changes), UNFIT) from error
+            if changes:
+                raise SettingError(named(changes), UNFIT) from error
+            raise ConfigError(
+                f"the weights in {name} do not fit the networks of {cls.__name__}: load it with the class that saved it"
+            ) from error
         return model
 
     def _change_parts(self, given: PlainMapping) -> None:

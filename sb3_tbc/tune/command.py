@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import torch as th
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.commands import INTERRUPTED, Parser, Several, positive_int, python, run_command, seed_number
+from sb3_tbc.commands import INTERRUPTED, Parser, Several, given_path, positive_int, python, run_command, seed_number
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.outside import flat_name, folder_name
@@ -80,7 +80,12 @@ def build_parser() -> Parser:
     )
     add("--grace-seconds", type=positive_int, default=120, help="a worker that has written nothing for this many "
         "seconds counts as dead, and its trial is started again")  # fmt: skip
-    add("--log-folder", type=Path, default=Path("runs/tune"), help="runs go to <folder>/<study>/trial_<n>/seed_<s>")
+    add(
+        "--log-folder",
+        type=given_path,
+        default=Path("runs/tune"),
+        help="runs go to <folder>/<study>/trial_<n>/seed_<s>",
+    )
     add("--device", default="cpu", help="torch device")
     add("--trial", metavar="best|N", help="do not search: train on this trial's settings with --seed")
     add(
@@ -114,10 +119,10 @@ def build_parser() -> Parser:
     add("--n-final-episodes", type=positive_int, help="episodes of the evaluation after training (default: 20)")
     add("--config", choices=CONFIGS, help="values of all settings that are not searched; by default tuned, for tasks "
                        "that have them")  # fmt: skip
-    add("--config-file", type=Path, help="take these values from this file, with sections as in zoo_configs")
+    add("--config-file", type=given_path, help="take these values from this file, with sections as in zoo_configs")
     add("--hyperparams", action=Several, metavar="NAME:VALUE", help="settings that keep this value in all trials")
     add("--search", action=Several, metavar="NAME", help="search only these parameters; * and ? are wildcards")
-    add("--search-space", type=Path, help="a file that changes ranges, see zoo_configs/search")
+    add("--search-space", type=given_path, help="a file that changes ranges, see zoo_configs/search")
     return parser
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import sys
@@ -76,7 +77,7 @@ def read_zip(path: Path) -> Plain:
 
     :raises ConfigError: if the file is missing, truncated, or not an agent of SB3's format
     """
-    if path.is_dir():
+    if os.path.isdir(path):  # a name that is too long, or a folder that is not ours, is told when it is read
         raise ConfigError(f"{path} is a folder, not an agent's .zip; {_inside(path)}")
     return read_data(read_bytes(path), str(path))
 
@@ -144,7 +145,9 @@ def algorithm_of(path: Path, data: Plain) -> str:
             return "hac"
         return "hits" if settings.get("target") == "decision" else "tbc-hrl"
     raise ConfigError(
-        f"{path} holds an agent of another algorithm ({name or origin or 'unknown'}), not of {', '.join(ALGORITHMS)}"
+        f"{path} holds an agent of another algorithm ({one_line(name or origin or 'unknown')}); this takes agents of "
+        f"{', '.join(ALGORITHMS)} that this package has trained. Load others with the class that saved them, and "
+        "measure them with SB3's evaluate_policy"
     )
 
 

@@ -79,11 +79,17 @@ def test_actors_are_made_as_described() -> None:
 
 @pytest.mark.parametrize(
     "text", ["", "fat", "lean:3", "lean,inter", "lean,colour=3", "mlp:0x3", "mlp:axb", "gru", "mlp,full",
-             "lean,rate=fast", "mlp,rate=0", "lean,rate_motors=3", "mlp,optimizer=sgd", "mlp,rate_gains=3", "gru:0"]
+             "lean,rate=fast", "mlp,rate=0", "lean,rate_motors=3", "paper,rate=inf", "mlp:\u00b2",
+             "mlp,optimizer=sgd", "mlp,rate_gains=3", "gru:0"]
 )  # fmt: skip
 def test_what_describes_no_actor_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="actor"):
         parse_actor(text)
+
+
+def test_an_mlp_that_would_be_smaller_than_asked_for_is_refused() -> None:
+    with pytest.raises(ConfigError, match="MLP of 999999999 parameters is too large"):
+        fit.best_of(parse_actor("mlp:999999999"), load_skill("delay3"), [1], [0])
 
 
 @pytest.mark.parametrize("text", ["paper,inter=0", "paper,readout=foo"])

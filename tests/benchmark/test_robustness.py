@@ -7,8 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from stable_baselines3 import SAC
 
 from sb3_tbc.benchmark import robustness
 from sb3_tbc.benchmark.command import benchmark
@@ -95,3 +97,16 @@ def test_the_command_prints_agents_side_by_side(few: None, capsys: Any, tmp_path
 def test_agents_of_different_tasks_are_refused(other: str, few: None) -> None:
     with pytest.raises(ConfigError, match="different tasks"):
         benchmark(["robustness", "pretrained:Pendulum", f"pretrained:{other}", "--n-episodes", "1"])
+
+
+@pytest.mark.parametrize("what", ["robustness", "record"])
+def test_an_agent_saved_without_its_environment_needs_env(what: str, tmp_path: Path) -> None:
+    env = gym.make("sb3_tbc/Pendulum-v0")
+    SAC("MultiInputPolicy", env, buffer_size=10).save(tmp_path / "sac.zip")
+    TBCHRL("MultiInputPolicy", env, compile=False).save(tmp_path / "plain.zip")
+    with pytest.raises(ConfigError, match=r"another algorithm .*Load others with the class that saved them"):
+        benchmark([what, str(tmp_path / "sac.zip")])
+    with pytest.raises(ConfigError, match="does not say on which environment it was trained; pass --env"):
+        benchmark([what, str(tmp_path / "plain.zip")])
+    with pytest.raises(ConfigError, match="unknown environment 'Pendulun'"):
+        benchmark([what, str(tmp_path / "plain.zip"), "--env", "Pendulun"])

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch as th
 from corridor import Corridor
+from stable_baselines3 import PPO
 
 from sb3_tbc import NDBCSAC, TBCHRL
-from sb3_tbc.errors import ConfigError
+from sb3_tbc.errors import ConfigError, WriteError
 from sb3_tbc.settings import SettingError
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.level_config import LowConfig
@@ -146,3 +147,24 @@ def test_an_agent_of_another_algorithm_is_refused_by_its_policy(taught: TBCHRL) 
                 continue
             with pytest.raises(ConfigError, match=f"{algorithm.__name__} has a .*: load it with the class"):
                 algorithm.load(file)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("trust", [False, True])
+def test_an_agent_of_stable_baselines3_is_refused_before_trust_is_asked_for(taught: TBCHRL, trust: bool) -> None:
+    file = io.BytesIO()
+    PPO("MultiInputPolicy", Corridor(20), n_steps=8, batch_size=8).save(file)  # type: ignore[arg-type]
+    for kind in (TBCHRL, FlatSAC, NDBCSAC):
+        with pytest.raises(ConfigError, match=r"where .* has a .*: load it with the class that saved it"):
+            kind.load(file, trust=trust)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="policy is a TBCPolicy"):
+        FlatSAC.load(saved(taught), trust=trust)  # type: ignore[arg-type]
+
+
+def test_odd_arguments_of_loading_and_saving_are_refused_in_one_line(taught: TBCHRL) -> None:
+    for path in (None, 3, ["a"]):
+        with pytest.raises(TypeError, match=r"from the path of its \.zip, or from an open file"):
+            TBCHRL.load(path)  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match="device must be"):
+        TBCHRL.load(saved(taught), device="tpu")  # type: ignore[arg-type]
+    with pytest.raises(WriteError, match="it is a folder"):
+        taught.save("")
