@@ -41,8 +41,8 @@ def build_parser() -> Parser:
     parser.add_argument("--seed", type=seed_number, default=HELD_OUT, help="seed of the episodes; by default one that "
                         "no training and none of its evaluations has used")  # fmt: skip
     parser.add_argument("--stochastic", action="store_true", help="sample actions as in training, instead of the means")
-    parser.add_argument("--json", type=_json_output, metavar="OUT", help="write the figures as JSON to this file and to "
-                        "standard output, the summary to standard error; with - to standard output only")  # fmt: skip
+    parser.add_argument("--json", type=_json_output, metavar="OUT", help="write the figures as JSON to this file and "
+                        "to standard output, the summary to standard error; with - only to standard output")  # fmt: skip
     parser.add_argument(
         "--video", type=output_file, metavar="OUT.mp4", help="film episodes with subgoal and remaining time"
     )
