@@ -42,7 +42,7 @@ def build_parser() -> Parser:
                         "no training and none of its evaluations has used")  # fmt: skip
     parser.add_argument("--stochastic", action="store_true", help="sample actions as in training, instead of the means")
     parser.add_argument("--json", type=_json_output, metavar="OUT", help="write the figures as JSON to this file and "
-                        "to standard output, the summary to standard error; with - only to standard output")  # fmt: skip
+                        "to standard output, the summary to standard error; with - there alone")  # fmt: skip
     parser.add_argument(
         "--video", type=output_file, metavar="OUT.mp4", help="film episodes with subgoal and remaining time"
     )
