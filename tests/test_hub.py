@@ -111,13 +111,13 @@ print("same")
 def test_a_stranger_s_agent_runs_no_code(hub: type[Handler]) -> None:
     """The same rules as for any file: what must be unpickled is refused."""
     code = """
-from stable_baselines3 import PPO
+from stable_baselines3 import SAC
 from sb3_tbc import load_from_hub, push_to_hub
-from sb3_tbc.recurrent import NDBCSAC
+from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.hub import download_from_hub
-push_to_hub(PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8), "owner/agent", "ppo.zip", card="# Mine")
+push_to_hub(SAC("MlpPolicy", "Pendulum-v1", buffer_size=10), "owner/agent", "sac.zip", card="# Mine")
 try:
-    NDBCSAC.load(download_from_hub("owner/agent", "ppo.zip"))
+    FlatSAC.load(download_from_hub("owner/agent", "sac.zip"))
 except Exception as error:
     print(type(error).__name__, error)
 """

@@ -80,12 +80,7 @@ def build_parser() -> Parser:
     )
     add("--grace-seconds", type=positive_int, default=120, help="a worker that has written nothing for this many "
         "seconds counts as dead, and its trial is started again")  # fmt: skip
-    add(
-        "--log-folder",
-        type=given_path,
-        default=Path("runs/tune"),
-        help="runs go to <folder>/<study>/trial_<n>/seed_<s>",
-    )
+    add("--log-folder", type=given_path, default=Path("runs/tune"), help="runs go to <folder>/<study>/trial_N/seed_S")
     add("--device", default="cpu", help="torch device")
     add("--trial", metavar="best|N", help="do not search: train on this trial's settings with --seed")
     add(
