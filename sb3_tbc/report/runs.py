@@ -131,6 +131,8 @@ def load_results(root: Path) -> Results:
 
     :raises ConfigError: if there is no run, or one or the table of these seeds cannot be read
     """
+    if not root.is_dir():
+        raise ConfigError(f"{root} is no folder; name the folder of the runs, e.g. runs, or the ledger, results")
     results: Results = defaultdict(lambda: defaultdict(list))
     for folder in finished_runs(root):
         try:

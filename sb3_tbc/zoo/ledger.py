@@ -323,11 +323,19 @@ class RunFolder:
 
 def _read(path: Path, read: Callable[[Path], object]) -> Plain:
     if not path.is_file():
-        raise ConfigError(f"{path.parent} holds no run: {path.name} is missing")
+        raise ConfigError(f"{path.parent} holds no run: {path.name} is missing{_meant(path.parent)}")
     data = read(path)
     if not isinstance(data, dict):
         raise ConfigError(f"{path} must hold named values, got {type(data).__name__}")
     return data
+
+
+def _meant(folder: Path) -> str:
+    """Name the run that may be meant: that of a file in it, or one below a folder of runs; empty if there is none."""
+    around = [folder.parent / CONFIG] if folder.is_file() else []
+    below = (path for depth in range(4) for path in sorted(folder.glob(f"{'*/' * depth}seed_*/{CONFIG}")))
+    found = next((path.parent for path in (*around, *below) if path.is_file()), None)
+    return f"; name the folder of a run, e.g. {found}" if found else ""
 
 
 def curve_summary(rows: list[EvaluationRow]) -> Plain:

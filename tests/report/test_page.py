@@ -230,6 +230,9 @@ def test_a_page_is_filled_between_its_marks(tmp_path: Path, capsys: pytest.Captu
     assert report.main([str(tmp_path / "results"), "--update", str(page)]) == 2
     assert "it is no UTF-8 text (invalid start byte at byte 2); save it as such\n" in capsys.readouterr().err
     assert report.main([str(tmp_path / "nowhere")]) == 2
+    assert "nowhere is no folder; name" in capsys.readouterr().err
+    (tmp_path / "nowhere").mkdir()
+    assert report.main([str(tmp_path / "nowhere")]) == 2
     assert "no finished runs" in capsys.readouterr().err
 
 

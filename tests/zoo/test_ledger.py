@@ -141,6 +141,15 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
         folder.read_final()
 
 
+@pytest.mark.parametrize("named", ["runs", "runs/Pendulum/tbc-hrl", "runs/Pendulum/tbc-hrl/full/seed_3/model.zip"])
+def test_the_folder_of_the_run_that_was_meant_is_named(named: str, tmp_path: Path) -> None:
+    run = RunFolder.for_run(tmp_path / "runs", "Pendulum", "tbc-hrl", "full", 3)
+    run.start({"seed": 3}, "train")
+    run.model.write_bytes(b"")
+    with pytest.raises(ConfigError, match=f"name the folder of a run, e.g. {run.path}$"):
+        RunFolder(tmp_path / named).read_config()
+
+
 def test_evaluations_round_trip(tmp_path: Path) -> None:
     path = tmp_path / "evaluations.csv"
     assert read_evaluations(path) == []
