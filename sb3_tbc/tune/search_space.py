@@ -191,7 +191,8 @@ def load_space(algo: str, task: str, extra: Path | None = None) -> dict[str, Pla
     for path in (space_file(algo), extra):
         sections = read_sections(path) if path is not None else {}
         if path is not None and not sections.keys() & {"default", task}:
-            raise ConfigError(f"{path} has neither a section default nor one of {task}; {nearest(task, sections)}")
+            given = ", ".join(sections) or "nothing"
+            raise ConfigError(f"{path} needs a section default or one named {task}, it has {given}")
         for name in ("default", task):
             for parameter, fields in sections.get(name, {}).items():
                 merged[parameter] = _over(merged.get(parameter), fields)

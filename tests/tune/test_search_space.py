@@ -304,5 +304,5 @@ def test_mistakes_in_a_file(tmp_path: Path, text: str, message: str) -> None:
 
 def test_a_file_without_a_section_for_the_task_is_refused(tmp_path: Path) -> None:
     (tmp_path / "space.yml").write_text("Pendulm: {low.tau: null}")
-    with pytest.raises(ConfigError, match="neither a section default nor one of Pendulum; did you mean 'Pendulm'"):
+    with pytest.raises(ConfigError, match=r"needs a section default or one named Pendulum, it has Pendulm$"):
         load_space("tbc-hrl", "Pendulum", tmp_path / "space.yml")
