@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_tbc.arrays import BoolArray, FloatArray, IntArray
+from sb3_tbc.smdp.cuts import cut_anew
 from sb3_tbc.smdp.options import Episode, OptionRules, TerminationReason
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
 from sb3_tbc.smdp.spaces import SubgoalSpace
@@ -126,6 +127,8 @@ class HindsightSettings(NamedTuple):
     keep_original: bool  # also store failed options as they were chosen (paper, algorithm 1 line 26)
     tolerance: float | None = None  # relabelled options further than this from where they ended are not a success
     goals_met: str = "passing"  # what counts as meeting a hindsight goal: "passing" it, or being there at the "end"
+    n_cuts: int = 0  # how often the episode is cut anew into windows, see :func:`.cut_anew`
+    cut_lengths: tuple[int, int] = (1, 1)  # fewest and most steps of these windows
 
 
 def relabel_actions(
@@ -226,7 +229,7 @@ def high_level_steps(
     """All SMDP transitions that the high level learns from in one episode, in this order:
 
     testing transitions (failed tests, chosen action, penalty), hindsight-action transitions of all options, and
-    copies of these with hindsight goals.
+    copies of these with hindsight goals; then those of the same episode cut anew, as often as asked for.
 
     A test that the task's success cut off has not failed: its subgoal was not needed any more.
 
@@ -238,17 +241,14 @@ def high_level_steps(
     :param goal_test: the task's rewards and ends under other goals
     :param rng: draws goals and time budgets
     """
-    actions, changed = relabel_actions(episode, views.subgoals, rules, rng, settings.tolerance)
-    options = _Options(episode, views.subgoals, actions, changed)
-    source = _TransitionSource(options, views, rules, reward, episode)
+    source = _TransitionSource(episode, views, rules, reward, settings, rng)
     parts = [source.failed_tests(settings.testing_penalty)]
     if settings.keep_original:
         parts.append(source.as_chosen())
-    parts.append(source.as_relabelled())
-    pairs = goal_pairs(len(options.starts), settings.n_goals, settings.goal_strategy, rng, options.event)
-    if len(pairs):
-        at_end = reward.target == "decision" or settings.goals_met == "end"
-        parts.append(source.with_hindsight_goals(pairs, goal_test, at_end))
+    parts += source.in_hindsight(goal_test, rng)
+    for _ in range(settings.n_cuts):
+        cut = cut_anew(episode, views.subgoals, settings.cut_lengths, rng)
+        parts += _TransitionSource(cut, views, rules, reward, settings, rng, chosen=False).in_hindsight(goal_test, rng)
     return HighLevelSteps(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
@@ -277,14 +277,28 @@ class _Options:
 
 
 class _TransitionSource:
-    """Makes the high level's transitions of an episode from its options."""
+    """Makes the high level's transitions of an episode from its options.
+
+    :param chosen: whether the high level chose these options; if not, there is nothing to be learned of those that
+        hindsight leaves out
+    """
 
     def __init__(
-        self, options: _Options, views: LevelViews, rules: OptionRules, reward: HighLevelReward, episode: Episode
+        self,
+        episode: Episode,
+        views: LevelViews,
+        rules: OptionRules,
+        reward: HighLevelReward,
+        settings: HindsightSettings,
+        rng: np.random.Generator,
+        chosen: bool = True,
     ) -> None:
-        self.options, self.views, self.rules, self.reward, self.episode = options, views, rules, reward, episode
+        actions, changed = relabel_actions(episode, views.subgoals, rules, rng, settings.tolerance)
+        self.options = options = _Options(episode, views.subgoals, actions, changed)
+        self.views, self.rules, self.reward, self.settings, self.episode = views, rules, reward, settings, episode
         self.rewards = reward.window_rewards(episode.rewards, options.starts, options.durations)
         self.bonus = reward.completion_bonus * (options.reached | options.changed)
+        self.left_out = np.zeros(len(changed), dtype=bool) if chosen else ~changed
 
     def failed_tests(self, penalty: float) -> HighLevelSteps:
         """Failed tests of subgoals, under the actions that were chosen, with the penalty as reward."""
@@ -299,10 +313,21 @@ class _TransitionSource:
         charged = self._charged(self.rewards[rows], o.chosen[rows])
         return self._steps(rows, o.chosen[rows], charged, o.dones[rows], o.durations[rows], False)
 
+    def in_hindsight(self, goal_test: GoalTest, rng: np.random.Generator) -> list[HighLevelSteps]:
+        """All options under their hindsight actions, and copies of them with hindsight goals."""
+        o, settings = self.options, self.settings
+        parts = [self.as_relabelled()]
+        pairs = goal_pairs(len(o.starts), settings.n_goals, settings.goal_strategy, rng, o.event)
+        pairs = pairs[~self.left_out[pairs[:, 0]]]
+        if len(pairs):
+            at_end = self.reward.target == "decision" or settings.goals_met == "end"
+            parts.append(self.with_hindsight_goals(pairs, goal_test, at_end))
+        return parts
+
     def as_relabelled(self) -> HighLevelSteps:
         """All options under their hindsight actions; a failed test that has none only has its penalty."""
         o = self.options
-        rows = np.flatnonzero(o.reached | o.changed | ~o.failed_test)
+        rows = np.flatnonzero((o.reached | o.changed | ~o.failed_test) & ~self.left_out)
         gained = self._charged(self.rewards, o.actions) + self.bonus
         return self._steps(rows, o.actions[rows], gained[rows], o.dones[rows], o.durations[rows], True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -97,6 +98,10 @@ class OptionRules:
         """Time budget in steps of a unit action coordinate in [-1, 1]."""
         steps = self.dt_min + 0.5 * (unit + 1.0) * (self.dt_max - self.dt_min)
         return np.maximum(np.rint(steps), 1.0) if self.whole_budgets else np.asarray(steps)
+
+    def lasts(self, budget: float) -> int:
+        """Steps that a window of this time budget lasts if nothing cuts it off, at least 1."""
+        return max(round(budget) if self.whole_budgets else math.ceil(budget), 1)
 
     def budget_that_lasted(self, steps: FloatArray, rng: np.random.Generator) -> FloatArray:
         """Time budgets that expire after exactly ``steps`` steps, drawn uniformly before rounding, ``(n,)``."""

@@ -13,6 +13,7 @@ from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.settings import SettingError
 from sb3_tbc.smdp.bounds import RewardRange, ValueBounds, high_level_bounds, low_level_bounds
+from sb3_tbc.smdp.cuts import most_windows
 from sb3_tbc.smdp.hindsight import HindsightSettings
 from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
@@ -63,7 +64,19 @@ def make_high_reward(config: TBCConfig, rules: OptionRules) -> HighLevelReward:
     )
 
 
-def hindsight_settings(config: TBCConfig) -> HindsightSettings:
+def fixed_budget(config: TBCConfig, rules: OptionRules) -> float:
+    """The time budget of ``duration: fixed``."""
+    return rules.dt_max if config.fixed_duration is None else config.fixed_duration
+
+
+def cut_lengths(config: TBCConfig, rules: OptionRules) -> tuple[int, int]:
+    """Fewest and most steps of a window that an episode is cut into anew: as of one that the high level may choose."""
+    if config.duration == "fixed":
+        return (steps := rules.lasts(fixed_budget(config, rules))), steps
+    return rules.lasts(rules.dt_min), rules.lasts(rules.dt_max)
+
+
+def hindsight_settings(config: TBCConfig, rules: OptionRules) -> HindsightSettings:
     """How episodes are rewritten for the high level."""
     return HindsightSettings(
         n_goals=config.n_hindsight_goals,
@@ -72,6 +85,8 @@ def hindsight_settings(config: TBCConfig) -> HindsightSettings:
         keep_original=config.keep_original,
         tolerance=config.relabel_tolerance,
         goals_met=config.goals_met,
+        n_cuts=config.n_hindsight_cuts,
+        cut_lengths=cut_lengths(config, rules),
     )
 
 
@@ -96,7 +111,7 @@ def make_schedule(
 ) -> FixedWindows | ReachRule | None:
     """Who sets time budgets (paper, section 4.1); None where the high level does."""
     if config.duration == "fixed":
-        return FixedWindows(rules, rules.dt_max if config.fixed_duration is None else config.fixed_duration)
+        return FixedWindows(rules, fixed_budget(config, rules))
     if config.duration == "rule" and reachability is not None:
         return ReachRule(views, rules, reachability, config.kappa)
     return None
@@ -208,7 +223,7 @@ def _make_level(
 # -------------------------------------------------------------------------------------------------- replay
 
 
-def refuse_small_buffers(config: TBCConfig, episode_length: int | None) -> None:
+def refuse_small_buffers(config: TBCConfig, rules: OptionRules, episode_length: int | None) -> None:
     """Refuse, before any step, buffers that do not hold what one episode may give: learning would end at that episode.
 
     :param episode_length: time limit of the task, environment steps; None where it has none
@@ -216,7 +231,9 @@ def refuse_small_buffers(config: TBCConfig, episode_length: int | None) -> None:
     """
     # of each option: a failed test, the copy in hindsight, the original, and one for each hindsight goal
     copies = 2 + config.keep_original + config.n_hindsight_goals
-    rows = {"high": int(config.max_options) * copies, "low": episode_length or 0}
+    cut = config.n_hindsight_cuts * most_windows(cut_lengths(config, rules), episode_length or 0)
+    high = int(config.max_options) * copies + cut * (1 + config.n_hindsight_goals)
+    rows = {"high": high, "low": episode_length or 0}
     for name, size in (("high", config.high.buffer_size), ("low", config.low.buffer_size)):
         if size < rows[name]:
             raise SettingError(

@@ -94,6 +94,9 @@ class AgentConfig(Settings):
     """Share of uniformly random actions on each level while exploring."""
     n_hindsight_goals: Annotated[int, Range(0, 1_000_000)] = 3
     """Number of hindsight goals for each transition."""
+    n_hindsight_cuts: Annotated[int, Range(0, 1000)] = 0
+    """How often a finished episode is cut anew into windows of random length. Whatever the low level did in such a
+    window is one more option, in hindsight, for the high level to learn from."""
     goal_strategy: Literal["future", "episode", "event"] = "future"
     """Where the high level's hindsight goals come from. ``future``: later options of the episode. ``episode``: any of
     its options. ``event``: the option that the task's event ended."""

@@ -215,7 +215,7 @@ class TBCHRL(TwoLevelSaving):
         self.high.replay_buffer, self.low.replay_buffer = self.replay_buffer  # type: ignore[assignment]
         self.store = EpisodeStore(
             self.replay_buffer, self.views, self.rules, self.high_reward, self.low_level_reward,
-            assembly.hindsight_settings(config), self.rng,
+            assembly.hindsight_settings(config, self.rules), self.rng,
         )  # fmt: skip
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -282,7 +282,7 @@ class TBCHRL(TwoLevelSaving):
         :raises TypeError: if ``total_timesteps`` is not a whole number
         """
         self._refuse_foreign_high("learn")
-        assembly.refuse_small_buffers(self.config, self.episode_length)
+        assembly.refuse_small_buffers(self.config, self.rules, self.episode_length)
         warn_of_idle_settings(self.config)
         total_timesteps = checks.whole_steps(total_timesteps)
         if self.env is None:
