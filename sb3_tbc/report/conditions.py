@@ -43,6 +43,17 @@ def _subgoal_view(run: Run) -> str | None:
     return "relative" if run.settings.get("relative_subgoals") else "absolute"
 
 
+def _cuts(run: Run) -> int | None:
+    """A part of our agent, and not of the others; what takes it out or puts it in differs in nothing else."""
+    if (
+        run.final["algo"] != OURS
+        or run.final.get("config") == "paper"
+        or "hindsight-cuts" in str(run.final.get("variant"))
+    ):
+        return None
+    return int(run.settings.get("n_hindsight_cuts") or 0)
+
+
 CONDITIONS: dict[str, Callable[[Run], object]] = {
     "observation": lambda run: (run.config.get("env_kwargs") or {}).get("observation", "paper"),
     "subgoals seen": _subgoal_view,
@@ -52,6 +63,7 @@ CONDITIONS: dict[str, Callable[[Run], object]] = {
     "high level's updates per step": _high("gradient_ratio"),
     "weight averaging": _low("average_decay"),
     "high level's weight averaging": _high("average_decay"),
+    "hindsight cuts": _cuts,
     "settings": lambda run: run.final.get("config"),
     "steps between evaluations": lambda run: run.config.get("eval_freq"),
     "episodes per evaluation": lambda run: run.config.get("n_eval_episodes"),

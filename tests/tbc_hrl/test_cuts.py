@@ -1,0 +1,50 @@
+"""Agents whose high level learns from episodes that are cut anew."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from corridor import Corridor
+
+from sb3_tbc import TBCHRL
+from sb3_tbc.settings import SettingError
+from sb3_tbc.tbc_hrl import assembly
+
+LEVEL: dict[str, Any] = {"batch_size": 16, "policy_kwargs": {"net_arch": [8, 8]}}
+
+
+def make(**kwargs: Any) -> TBCHRL:
+    given = {"high": LEVEL, "low": LEVEL, "max_options": 6, "gradient_ratio": 0.1, "compile": False, "seed": 0}
+    return TBCHRL("MultiInputPolicy", Corridor(30), **{**given, **kwargs})
+
+
+@pytest.mark.parametrize(
+    ("settings", "lengths"),
+    [
+        ({}, (1, 5)),
+        ({"dt_min": 2.0, "dt_max": 4.5}, (2, 5)),
+        ({"dt_min": 2.2, "dt_max": 4.4, "whole_budgets": True}, (2, 4)),
+        ({"duration": "fixed", "target": "decision"}, (5, 5)),
+        ({"duration": "fixed", "fixed_duration": 3.5, "target": "decision"}, (4, 4)),
+    ],
+)
+def test_windows_are_as_long_as_the_high_level_may_choose_them(
+    settings: dict[str, Any], lengths: tuple[int, int]
+) -> None:
+    model = make(**settings)
+    assert assembly.cut_lengths(model.config, model.rules) == lengths
+
+
+def test_the_high_level_has_more_to_learn_from() -> None:
+    without, with_cuts = (make(n_hindsight_cuts=cuts).learn(60).replay_buffer.high for cuts in (0, 4))
+    assert with_cuts.size() > 2 * without.size()
+    assert np.isfinite(with_cuts.data["actions"][: with_cuts.size()]).all()
+
+
+def test_a_buffer_must_hold_the_cuts_of_an_episode() -> None:
+    small = {**LEVEL, "buffer_size": 6 * 5}
+    make(high=small).learn(1)
+    with pytest.raises(SettingError, match=r"of 30 does not hold an episode, which may give the high level 278"):
+        make(high=small, n_hindsight_cuts=2).learn(1)
