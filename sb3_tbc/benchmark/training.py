@@ -161,8 +161,8 @@ def split(task: str, steps: int, rounds: int, config: str | None = None, n_envs:
     warm_up(model, steps)
     runs = [profile(model, steps) for _ in range(rounds)]
     parts = {part: statistics.median(run[part] for run in runs) for part in PARTS}
-    share = statistics.median(sum(run[part] for part in OUTSIDE) / run["environment"] for run in runs)
     outside = sum(parts[part] for part in OUTSIDE)
+    share = outside / parts["environment"]  # of the row's own figures: a median of shares would contradict them
     lines = [
         f"| {task}, {model.n_envs} at once, microseconds per step | {' | '.join(PARTS)} |"
         " all but environment, batches, updates |",

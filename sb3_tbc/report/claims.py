@@ -15,7 +15,7 @@ ABLATION_CLAIMS = {
     f"{OURS} no-ndbc": ("needs the circuit where space is complex", SPATIAL_TASKS),
 }
 HOLDS, SAME, OPPOSITE = "holds", "no difference shown", "the opposite"
-SOONER = {True: "yes", False: "no", None: "not decided: too few steps"}
+SOONER = {True: "sooner, not tested", False: "not sooner, not tested", None: "not decided: too few steps"}
 
 
 class Claim(NamedTuple):

@@ -41,6 +41,22 @@ def test_command_prints_and_writes_json(tmp_path, capsys):
         benchmark(["train", "--what", "sped"])
 
 
+def test_the_share_outside_follows_from_the_printed_parts(monkeypatch):
+    rounds = iter(
+        [
+            dict.fromkeys(PARTS, 0.0) | {"environment": 10.0, "acting": 2.0},
+            dict.fromkeys(PARTS, 0.0) | {"environment": 40.0, "acting": 20.0},
+            dict.fromkeys(PARTS, 0.0) | {"environment": 20.0, "acting": 18.0},
+        ]
+    )
+    monkeypatch.setattr(benchmark_train, "profile", lambda model, steps: next(rounds))
+    lines, figures = benchmark_train.split("Drawbridge", 60, 3)
+    assert figures["parts"]["environment"] == 20.0
+    assert figures["outside"] == 18.0
+    assert figures["share_of_environment"] == pytest.approx(0.9)  # the median of the three shares is 0.5
+    assert "18.0 = 90% of the environment's" in lines[-1]
+
+
 def test_stopwatch_charges_the_innermost(monkeypatch):
     readings = iter([0.0, 1.0, 3.0, 6.0])  # outer begins, inner begins, inner ends, outer ends
     monkeypatch.setattr("sb3_tbc.benchmark.profile.time.perf_counter", lambda: next(readings))

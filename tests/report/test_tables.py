@@ -170,10 +170,10 @@ def test_a_method_that_never_learns_meets_no_threshold(tmp_path: Path) -> None:
     ("ours", "theirs", "said", "verdict"),
     [
         ([0, 0, 0, 1], [0, 0], "trained for 2,000 only, ours needs 4,000", "not decided: too few steps"),
-        ([0, 1, 1, 1], [0, 0], "not reached in 2,000", "yes"),
-        ([0, 0, 0, 1], [0, 1], "-2,000", "no"),
+        ([0, 1, 1, 1], [0, 0], "not reached in 2,000", "sooner, not tested"),
+        ([0, 0, 0, 1], [0, 1], "-2,000", "not sooner, not tested"),
         ([0, 0], [0, 0, 1, 1], "ours was trained for 2,000 only, the other needs 3,000", "not decided: too few steps"),
-        ([0, 0, 0], [0, 0, 1, 1], "ours does not reach it", "no"),
+        ([0, 0, 0], [0, 0, 1, 1], "ours does not reach it", "not sooner, not tested"),
     ],
 )
 def test_a_curve_that_ends_early_proves_no_delay(
