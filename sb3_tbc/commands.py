@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import io
 import math
 import os
@@ -15,11 +16,12 @@ from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
 from sb3_tbc.errors import ConfigError, EnvironmentFault, NonFiniteError, TrainingError, WriteError
-from sb3_tbc.files import require_writable
+from sb3_tbc.files import FULL, require_writable
 
 FAILED = 1
 USER_MISTAKE = 2
 INTERRUPTED = 130
+STANDARD_OUTPUT = Path("-")
 MOST_THREADS = 1024
 """More threads than any machine for this package has cores; torch crashes when it cannot make them all."""
 TOLD = (ConfigError, WriteError, TrainingError, EnvironmentFault, NonFiniteError)
@@ -95,9 +97,30 @@ class Parser(argparse.ArgumentParser):
         settings = {"allow_abbrev": False, **settings}
         super().__init__(prog, description=text, formatter_class=HelpFormatter, epilog=epilog, **settings)
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse, and refuse a file that the command is to write and that another argument names, too."""
+        parsed, rest = super().parse_known_args(args, namespace)
+        paths: dict[Path, argparse.Action] = {}
+        for action in sorted(self._actions, key=self._writes):
+            value = getattr(parsed, action.dest, None)
+            if not isinstance(value, Path):
+                continue
+            other = paths.setdefault(Path(os.path.realpath(value)), action)
+            if other is not action and self._writes(action):
+                self.error(f"{_named(other)} and {_named(action)} name the same file, {value}; give each its own")
+        return parsed, rest
+
+    @staticmethod
+    def _writes(action: argparse.Action) -> bool:
+        return action.type in (output_file, file_or_standard_output)
+
     def error(self, message: str) -> NoReturn:
         """Say what is wrong and exit with status 2."""
         self.exit(USER_MISTAKE, f"{self.prog}: error: {message} (see {self.prog} --help)\n")
+
+
+def _named(action: argparse.Action) -> str:
+    return action.option_strings[0] if action.option_strings else str(action.metavar or action.dest)
 
 
 def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequence[str] | None = None) -> int:
@@ -108,6 +131,7 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
     :param argv: arguments, by default those of the process
     :return: exit status
     """
+    _open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a path that the terminal cannot show is no reason to fail
@@ -117,16 +141,42 @@ def run_command(command: Callable[[Sequence[str]], int], name: str, argv: Sequen
         finally:
             sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # else Python tries again at its end
+        _drop_output()
         print(f"{name}: error: broken pipe: what reads the output has ended", file=sys.stderr)
         return FAILED
     except TOLD as error:
         return tell(error, name)
+    except UnicodeEncodeError as error:  # other packages take such names for text
+        cure = "rename it, or set LC_ALL=C.UTF-8 if this locale is the reason"
+        return tell(ConfigError(f"{error.object!r} is no text, perhaps the name of a file; {cure}"), name)
     except PermissionError as error:
         return tell(WriteError(f"no permission for {error.filename}; is it yours, or open to you?"), name)
+    except OSError as error:
+        if error.errno not in FULL or error.filename is not None:
+            raise
+        _drop_output()
+        return tell(WriteError(f"cannot write the output: {error.strerror}; make room, then go on"), name)
     except KeyboardInterrupt:
         print(f"{name}: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _open_closed_streams() -> None:
+    """Lead streams that the shell has closed (``>&-``) to nowhere; the next file opened would take their place."""
+    handle = os.open(os.devnull, os.O_RDWR)
+    while handle <= 2:
+        os.set_inheritable(handle, True)
+        handle = os.open(os.devnull, os.O_RDWR)
+    os.close(handle)
+    for stream in ("stdout", "stderr"):
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 it stays open
+
+
+def _drop_output() -> None:
+    """Lead standard output to nowhere, as Python writes what is left of it again at its end."""
+    with contextlib.suppress(OSError, ValueError):  # a stream without a file
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def tell(error: Exception, name: str) -> int:
@@ -190,6 +240,11 @@ def output_file(text: str) -> Path:
     except WriteError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return path
+
+
+def file_or_standard_output(text: str) -> Path:
+    """As :func:`output_file`; ``-`` is :data:`STANDARD_OUTPUT`."""
+    return STANDARD_OUTPUT if text == str(STANDARD_OUTPUT) else output_file(text)
 
 
 def seed_number(text: str) -> int:

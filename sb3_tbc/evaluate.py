@@ -9,7 +9,17 @@ from pathlib import Path
 import torch as th
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.commands import Parser, add_trust, output_file, positive_int, run_command, seed_number, thread_count
+from sb3_tbc.commands import (
+    STANDARD_OUTPUT,
+    Parser,
+    add_trust,
+    file_or_standard_output,
+    output_file,
+    positive_int,
+    run_command,
+    seed_number,
+    thread_count,
+)
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
@@ -28,9 +38,6 @@ EXAMPLES = {
 }
 
 
-STANDARD_OUTPUT = Path("-")
-
-
 def build_parser() -> Parser:
     """The command's arguments."""
     parser = Parser("sb3_tbc.evaluate", EXAMPLES, description=__doc__)
@@ -41,8 +48,8 @@ def build_parser() -> Parser:
     parser.add_argument("--seed", type=seed_number, default=HELD_OUT, help="seed of the episodes; by default one that "
                         "no training and none of its evaluations has used")  # fmt: skip
     parser.add_argument("--stochastic", action="store_true", help="sample actions as in training, instead of the means")
-    parser.add_argument("--json", type=_json_output, metavar="OUT", help="write the figures as JSON to this file and "
-                        "to standard output, the summary to standard error; with - there alone")  # fmt: skip
+    parser.add_argument("--json", type=file_or_standard_output, metavar="OUT", help="write the figures as JSON to this "
+                        "file and to standard output, the summary to standard error; with - there alone")  # fmt: skip
     parser.add_argument(
         "--video", type=output_file, metavar="OUT.mp4", help="film episodes with subgoal and remaining time"
     )
@@ -52,11 +59,6 @@ def build_parser() -> Parser:
     parser.add_argument("--device", default="cpu", help="torch device")
     parser.add_argument("--num-threads", type=thread_count, default=1, help="torch threads")
     return parser
-
-
-def _json_output(text: str) -> Path:
-    """The file for the figures; ``-`` is standard output alone."""
-    return STANDARD_OUTPUT if text == str(STANDARD_OUTPUT) else output_file(text)
 
 
 def identify(path: Path, env: str | None, trust: bool = False) -> Plain:
@@ -161,10 +163,10 @@ def _tell(result: PlainMapping, json_out: Path | None) -> None:
         print(describe(result))
         return
     text = to_json(result)
-    print(text, end="")
     if json_out != STANDARD_OUTPUT:
         write_atomic(json_out, text)
         print(describe(result), file=sys.stderr)
+    print(text, end="")
 
 
 def _watch(

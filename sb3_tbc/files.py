@@ -130,6 +130,8 @@ def require_writable(path: Path) -> None:
 def _require_file(path: Path) -> None:
     if path.is_dir():
         raise WriteError(f"cannot write {path}: it is a folder; name a file, e.g. one in it")
+    if path.exists() and not path.is_file():  # a new file takes its place, also that of /dev/null
+        raise WriteError(f"cannot write {path}: it is a device or a pipe, which a file would replace; name a file")
 
 
 def write_atomic(path: Path, text: str) -> None:

@@ -240,11 +240,12 @@ def _train(args: argparse.Namespace, argv: Sequence[str], stop: StopRequest) -> 
     except Interrupted as stopped:
         print(f"{stopped}; continue with: {options.resume_line(stopped.folder)}", file=sys.stderr)
         return INTERRUPTED
-    print(describe(result, folder))
+    lines = [describe(result, folder)]
     if args.ledger is not None:
         target = _ledger_folder(args.ledger, result)
         folder.copy_to(target)
-        print(f"ledger         {target.path}")
+        lines.append(f"ledger         {target.path}")
+    print("\n".join(lines))  # last, as nobody may read it any more
     return 0
 
 

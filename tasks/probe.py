@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import NamedTuple, SupportsFloat
 
 import numpy as np
 from gymnasium import spaces
@@ -62,7 +62,7 @@ def run_probe(env: Env, n_steps: int, seed: int = 0, episode_steps: int = 50) ->
             if step % 5 == 0:
                 action = rng.uniform(actions.low, actions.high).astype(actions.dtype)
             observation, reward, terminated, truncated, info = env.step(action)
-            wrong = _what_is_wrong(env, observation, float(reward))
+            wrong = _what_is_wrong(env, observation, reward)
             ended = bool(terminated or truncated or wrong)
             if wrong is None:
                 after.append(len(seen))
@@ -88,7 +88,7 @@ def _first(env: Env, seed: int | None = None) -> dict[str, Floats]:
     return _copied(observation)
 
 
-def _what_is_wrong(env: Env, observation: GoalObservation, reward: float = 0.0) -> str | None:
+def _what_is_wrong(env: Env, observation: GoalObservation, reward: SupportsFloat = 0.0) -> str | None:
     """What is not finite, or of another shape than its space says; None if nothing is."""
     assert isinstance(env.observation_space, spaces.Dict)
     whose = f"of {type(env.unwrapped).__name__}"
@@ -99,7 +99,9 @@ def _what_is_wrong(env: Env, observation: GoalObservation, reward: float = 0.0) 
             return f"observation[{key!r}] {whose} has shape {given}, not {shape} as its space says,"
         if not np.isfinite(observation[key]).all():
             return f"observation[{key!r}] {whose} is not finite"
-    return None if np.isfinite(reward) else f"the reward {whose} is {reward}"
+    if shape := np.asarray(reward).shape:
+        return f"the reward {whose} is no number but an array of shape {shape}"
+    return None if np.isfinite(float(reward)) else f"the reward {whose} is {reward}"
 
 
 def _copied(observation: GoalObservation) -> dict[str, Floats]:

@@ -81,7 +81,8 @@ class OnnxPlayer:
         onnxruntime = require("onnxruntime", extra="export", what="--check with --format onnx")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
-        self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+        # its content, as onnxruntime takes only names that are UTF-8
+        self.session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
         self.inputs = [i for i in self.session.get_inputs() if i.name not in GOAL_KEYS]
         self.outputs = [o.name for o in self.session.get_outputs()]
         self.reset()

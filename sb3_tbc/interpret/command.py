@@ -82,8 +82,8 @@ def command(argv: Sequence[str]) -> int:
     try:
         effort = Effort(args.n_random, args.max_alone, args.synapses)
         found = investigate(model, units, space, info["task"], episodes, effort)
-        print(describe(found), end="")
         _write(args, found, model, info, space, episodes)
+        print(describe(found), end="")
     finally:
         episodes.close()
     return 0

@@ -40,10 +40,6 @@ def command(argv: Sequence[str]) -> int:
     """Report; see ``--help``."""
     args = build_parser().parse_args(argv)
     report = load_report(args.results)
-    print("\n\n".join(f"{title}\n\n{to_text(table)}" for title, table in all_tables(report.results).items()))
-    print(f"\n{NOTES}")
-    if report.failed:
-        print("\n" + "\n".join(f"failed         {path}" for path in report.failed))
     if args.update is not None:
         update_page(args.update, to_markdown(report))
     if args.curves is not None:
@@ -52,6 +48,12 @@ def command(argv: Sequence[str]) -> int:
         write_atomic(args.measured, measured_yaml(report.results))
     if args.html is not None:
         write_atomic(args.html, to_html(report, args.html))
+    # last, as what reads the output may end before it has all, like head
+    print("\n\n".join(f"{title}\n\n{to_text(table)}" for title, table in all_tables(report.results).items()))
+    print(f"\n{NOTES}")
+    if report.failed:
+        print("\n" + "\n".join(f"failed         {path}" for path in report.failed))
+    if args.html is not None:
         print(f"\nreport         {args.html}")
     return 0
 

@@ -184,7 +184,10 @@ def describe(trial: FrozenTrial) -> str:
 
 
 def _say(index: int, text: str) -> None:
-    print(f"worker {index}: {text}", flush=True)
+    try:
+        print(f"worker {index}: {text}", flush=True)
+    except BrokenPipeError as error:  # what reads the output has ended; no fault of the trial
+        raise KeyboardInterrupt from error
 
 
 # --------------------------------------------------------------------------------------------- processes

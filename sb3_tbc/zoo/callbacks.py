@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import signal
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -131,7 +132,7 @@ class SuccessEvalCallback(EventCallback):
         if eval_freq < 1 or n_eval_episodes < 1:
             raise ValueError(f"eval_freq and n_eval_episodes must be at least 1, got {eval_freq} and {n_eval_episodes}")
         self.eval_env = eval_env if stop is None else StoppableVecEnv(eval_env, stop)
-        self.stoppable, self.given_up = stop is not None, False
+        self.stop, self.given_up = stop, False
         self.eval_freq = eval_freq
         self.n_eval_episodes = n_eval_episodes
         self.seed = seed
@@ -161,7 +162,7 @@ class SuccessEvalCallback(EventCallback):
         super()._on_training_start()
         self._last = min(self._last, self.model.num_timesteps)  # another call of learn may count from zero again
         # before anything is learnt: the resumed run then evaluates the agent that an undisturbed one does
-        if self.stoppable and self._is_due() and not self._evaluate_unless_stopped():
+        if self.stop is not None and self._is_due() and not self._evaluate_unless_stopped():
             raise StopTraining
 
     def _on_step(self) -> bool:
@@ -214,11 +215,18 @@ class SuccessEvalCallback(EventCallback):
         if is_best and self.callback_on_new_best is not None:
             self.callback_on_new_best.on_step()
         if self.verbose:
-            options = f", subgoals reached {row.subgoal_success:.2f}, window {row.mean_window:.1f} steps"
-            print(
-                f"{row.timesteps:>9,} steps: success {row.success_rate:.2f}, length {row.mean_length:.0f}"
-                f"{'' if math.isnan(row.mean_window) else options}"  # a flat agent has no options
-            )
+            self._tell(row)
+
+    def _tell(self, row: EvaluationRow) -> None:
+        """Print a row at once, also into a file; if what reads the output has ended, training is asked to stop."""
+        options = f", subgoals reached {row.subgoal_success:.2f}, window {row.mean_window:.1f} steps"
+        line = f"{row.timesteps:>9,} steps: success {row.success_rate:.2f}, length {row.mean_length:.0f}"
+        try:
+            print(line + ("" if math.isnan(row.mean_window) else options), flush=True)  # a flat agent has no options
+        except BrokenPipeError:
+            if self.stop is None:
+                raise
+            self.stop.ask(getattr(signal, "SIGPIPE", signal.SIGTERM))  # Windows has no such signal
 
 
 def _quality(row: EvaluationRow) -> tuple[float, float]:

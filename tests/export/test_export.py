@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import subprocess
 import sys
@@ -42,6 +43,16 @@ ANT = {"inter": 12, "command": 10, "motor": 8, "sensory_fanout": 5, "inter_fanou
 def pendulum() -> tuple[TBCHRL, ExportedPolicy]:
     model, _ = make("reached")
     return model, extract(model, "pendulum")
+
+
+@pytest.mark.parametrize("kind", ["numpy", "onnx", pytest.param("c", marks=needs_cc)])
+def test_its_file_may_have_any_name(kind: str, pendulum: tuple[TBCHRL, ExportedPolicy], tmp_path: Path) -> None:
+    if kind == "onnx":
+        pytest.importorskip("onnxruntime")
+    path = tmp_path / os.fsdecode(b"\xe4 [1]%d")
+    path = path.with_suffix(sb3_tbc.export.command.SUFFIXES[kind])
+    sb3_tbc.export.command.WRITERS[kind](pendulum[1], path)
+    player(kind, path, pendulum[1])
 
 
 @pytest.mark.parametrize("kind", ["numpy", "onnx", pytest.param("c", marks=needs_cc)])

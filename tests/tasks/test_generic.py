@@ -396,3 +396,13 @@ def test_a_bad_step_of_random_episodes_is_left_out(wrong):
     Once.always = True
     with pytest.raises(ValueError, match=r"'observation'. of Once (is not finite|has shape .3,.*) in every step"):
         run_probe(Once(), 100)
+
+
+def test_a_reward_is_one_number():
+    class Array(Point):
+        def step(self, action):
+            seen, reward, *rest = super().step(action)
+            return seen, np.array([reward]), *rest
+
+    with pytest.raises(ValueError, match=r"the reward of Array is no number but an array of shape \(1,\)"):
+        run_probe(Array(), 100)

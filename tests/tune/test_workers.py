@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import shlex
 import signal
@@ -28,6 +29,18 @@ MODULES = os.pathsep.join([str(HERE), str(HERE.parent)])
 NAME = "tbc-hrl-TunedCorridor-v0"
 GRACE = 8
 N_TRIALS = 3
+
+
+def test_output_that_nobody_reads_is_no_fault_of_a_trial(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It stops the worker as Ctrl-C does, which puts the trial back without counting a retry."""
+
+    class Broken(io.StringIO):
+        def flush(self) -> None:
+            raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(sys, "stdout", Broken())
+    with pytest.raises(KeyboardInterrupt):
+        worker._say(0, "trial 0 begins")
 
 
 def command(folder: Path, storage: str, *more: str) -> list[str]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import io
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 
 from sb3_tbc.errors import ConfigError
+from sb3_tbc.stopping import StopRequest
 from sb3_tbc.zoo import callbacks
 from sb3_tbc.zoo.callbacks import OptionTraceCallback, SuccessEvalCallback, TimedCheckpointCallback, read_evaluations
 
@@ -92,6 +95,25 @@ def test_evaluates_on_time_and_keeps_the_best(agent: Agent, tmp_path: Path, monk
     assert seeds == [4007]
     assert len(read_evaluations(csv_path)) == 5
     assert best.read_text() == "agent at 21"
+
+
+def test_training_is_asked_to_stop_where_nobody_reads_its_output(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken(io.StringIO):
+        def flush(self) -> None:  # of each line, so that a file has it at once
+            raise BrokenPipeError(32, "Broken pipe")
+
+    monkeypatch.setattr(callbacks, "evaluate_agent", evaluation([0.5] * 2, []))
+    monkeypatch.setattr(sys, "stdout", Broken())
+    stop = StopRequest()
+    envs = SimpleNamespace(num_envs=1, observation_space=None, action_space=None, render_mode=None)
+    callback = SuccessEvalCallback(envs, 10, 4, verbose=1, stop=stop)  # type: ignore[arg-type]
+    callback.init_callback(agent)  # type: ignore[arg-type]
+    steps(callback, agent, 10)
+    assert stop
+    alone = SuccessEvalCallback(envs, 10, 4, verbose=1)  # type: ignore[arg-type]
+    alone.init_callback(agent)  # type: ignore[arg-type]
+    with pytest.raises(BrokenPipeError):
+        alone.on_step()
 
 
 def test_a_second_training_is_evaluated_too(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
