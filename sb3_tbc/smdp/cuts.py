@@ -40,12 +40,3 @@ def _without_first(episode: Episode, steps: int) -> Episode:
     """An episode that begins some steps later."""
     per_step = (name for name in Episode._fields if isinstance(getattr(episode, name), np.ndarray))
     return episode._replace(**{name: getattr(episode, name)[steps:] for name in per_step})
-
-
-def most_windows(lengths: tuple[int, int], episode_length: int) -> int:
-    """How many windows an episode without events is cut into at most.
-
-    :param lengths: fewest and most steps of a window
-    :param episode_length: environment steps
-    """
-    return episode_length // lengths[0] + 1

@@ -117,6 +117,10 @@ class HighLevelSteps(NamedTuple):
     local: FloatArray  # (n, local_dim) what the low level saw when the option began
     here: FloatArray  # (n, subgoal_dim) and the subgoal-space point where it began
 
+    def first(self, rows: int) -> HighLevelSteps:
+        """So many of them, or all if there are fewer."""
+        return self._replace(**{name: column[:rows] for name, column in self._asdict().items()})
+
 
 class HindsightSettings(NamedTuple):
     """How much hindsight the high level uses."""

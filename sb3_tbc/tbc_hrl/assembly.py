@@ -13,7 +13,6 @@ from sb3_tbc.level.level import SACLevel
 from sb3_tbc.replay.buffers import OptionReplayBuffer, SubgoalReplayBuffer
 from sb3_tbc.settings import SettingError
 from sb3_tbc.smdp.bounds import RewardRange, ValueBounds, high_level_bounds, low_level_bounds
-from sb3_tbc.smdp.cuts import most_windows
 from sb3_tbc.smdp.hindsight import HindsightSettings
 from sb3_tbc.smdp.options import OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward, LowLevelReward
@@ -223,17 +222,16 @@ def _make_level(
 # -------------------------------------------------------------------------------------------------- replay
 
 
-def refuse_small_buffers(config: TBCConfig, rules: OptionRules, episode_length: int | None) -> None:
+def refuse_small_buffers(config: TBCConfig, episode_length: int | None) -> None:
     """Refuse, before any step, buffers that do not hold what one episode may give: learning would end at that episode.
 
     :param episode_length: time limit of the task, environment steps; None where it has none
     :raises SettingError: naming the level and the smallest size
     """
-    # of each option: a failed test, the copy in hindsight, the original, and one for each hindsight goal
+    # of each option: a failed test, the copy in hindsight, the original, and one for each hindsight goal. Of what cuts
+    # add, a buffer takes as much as it holds
     copies = 2 + config.keep_original + config.n_hindsight_goals
-    cut = config.n_hindsight_cuts * most_windows(cut_lengths(config, rules), episode_length or 0)
-    high = int(config.max_options) * copies + cut * (1 + config.n_hindsight_goals)
-    rows = {"high": high, "low": episode_length or 0}
+    rows = {"high": int(config.max_options) * copies, "low": episode_length or 0}
     for name, size in (("high", config.high.buffer_size), ("low", config.low.buffer_size)):
         if size < rows[name]:
             raise SettingError(

@@ -198,5 +198,5 @@ class EpisodeStore:
         self._compare(goal_test, episode.achieved_goal[1:], episode.desired_goal[1:], episode.rewards)
         self.replay.low.extend(low_level_steps(episode, self.low_reward))
         steps = high_level_steps(episode, self.views, self.rules, self.reward, self.hindsight, goal_test, self.rng)
-        self.replay.high.extend(steps)
+        self.replay.high.extend(steps.first(self.replay.high.buffer_size))  # cuts come last; a small buffer holds some
         return steps

@@ -282,7 +282,7 @@ class TBCHRL(TwoLevelSaving):
         :raises TypeError: if ``total_timesteps`` is not a whole number
         """
         self._refuse_foreign_high("learn")
-        assembly.refuse_small_buffers(self.config, self.rules, self.episode_length)
+        assembly.refuse_small_buffers(self.config, self.episode_length)
         warn_of_idle_settings(self.config)
         total_timesteps = checks.whole_steps(total_timesteps)
         if self.env is None:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from two_windows import ENV, GOALS, LAYOUT, RULES, episode, option
 
-from sb3_tbc.smdp.cuts import cut_anew, most_windows
+from sb3_tbc.smdp.cuts import cut_anew
 from sb3_tbc.smdp.hindsight import HighLevelSteps, HindsightSettings, high_level_steps
 from sb3_tbc.smdp.options import Episode, OptionRules
 from sb3_tbc.smdp.rewards import HighLevelReward
@@ -47,7 +47,6 @@ def test_windows_follow_each_other_and_have_lengths_that_can_be_chosen(
     np.testing.assert_array_equal(cut.achieved_goal, walk(steps).achieved_goal[steps - cut.length :])
     assert all(lengths[0] <= o.duration <= lengths[1] for o in options[:-1])
     assert 1 <= options[-1].duration <= lengths[1]
-    assert len(options) <= most_windows(lengths, steps)
 
 
 def test_cuts_differ() -> None:
