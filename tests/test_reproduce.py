@@ -49,8 +49,8 @@ def test_ablations_have_folders_of_their_own(tmp_path: Path) -> None:
 def test_all_ablations_in_one_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     planned = list(reproduce.jobs(campaign(tmp_path, "--algos", "tbc-hrl", "--ablations", "--seeds", "1")))
     names = [job.target.path.parent.name for job in planned]
-    assert len(set(names)) == len(names) == 11
-    assert {"no-ts", "with-memory", "with-early-end", "no-smdp"} <= set(names)
+    assert len(set(names)) == len(names) == 12
+    assert {"no-ts", "with-memory", "with-early-end", "no-smdp", "no-hindsight-cuts"} <= set(names)
     for job, name in zip(planned, names, strict=True):
         assert f"--ablation {name}" in " ".join(job.command())
     assert reproduce.main(campaign(tmp_path, "--ablations")) == 2
