@@ -43,12 +43,13 @@ def _subgoal_view(run: Run) -> str | None:
     return "relative" if run.settings.get("relative_subgoals") else "absolute"
 
 
-def _cuts(run: Run) -> int | None:
+def _cuts(run: Run) -> str | None:
     """A part of our agent, and not of the others; what takes it out or puts it in differs in nothing else."""
     own = "-cuts" in str(run.final.get("variant"))
     if run.final["algo"] != OURS or run.final.get("config") == "paper" or own:
         return None
-    return int(run.settings.get("n_hindsight_cuts") or 0)
+    cuts, share = int(run.settings.get("n_hindsight_cuts") or 0), run.settings.get("hindsight_cuts_fraction", 1.0)
+    return f"{cuts}" if share == 1.0 or not cuts else f"{cuts} in the first {share:.0%}"
 
 
 CONDITIONS: dict[str, Callable[[Run], object]] = {

@@ -133,6 +133,11 @@ class HindsightSettings(NamedTuple):
     goals_met: str = "passing"  # what counts as meeting a hindsight goal: "passing" it, or being there at the "end"
     n_cuts: int = 0  # how often the episode is cut anew into windows, see :func:`.cut_anew`
     cut_lengths: tuple[int, int] = (1, 1)  # fewest and most steps of these windows
+    cuts_fraction: float = 1.0  # share of the training, from its beginning, with such cuts
+
+    def after(self, progress: float) -> HindsightSettings:
+        """These settings when this share of the training is done."""
+        return self if progress <= self.cuts_fraction else self._replace(n_cuts=0)
 
 
 def relabel_actions(

@@ -86,6 +86,7 @@ def hindsight_settings(config: TBCConfig, rules: OptionRules) -> HindsightSettin
         goals_met=config.goals_met,
         n_cuts=config.n_hindsight_cuts,
         cut_lengths=cut_lengths(config, rules),
+        cuts_fraction=config.hindsight_cuts_fraction,
     )
 
 

@@ -193,10 +193,14 @@ class EpisodeStore:
         self.reward, self.low_reward, self.hindsight, self.rng = reward, low_reward, hindsight, rng
         self._compare = RewardComparison()
 
-    def add(self, episode: Episode, goal_test: GoalTest) -> HighLevelSteps:
-        """Store an episode; what the high level learns from it."""
+    def add(self, episode: Episode, goal_test: GoalTest, progress: float = 0.0) -> HighLevelSteps:
+        """Store an episode; what the high level learns from it.
+
+        :param progress: share of the training that is done
+        """
         self._compare(goal_test, episode.achieved_goal[1:], episode.desired_goal[1:], episode.rewards)
         self.replay.low.extend(low_level_steps(episode, self.low_reward))
-        steps = high_level_steps(episode, self.views, self.rules, self.reward, self.hindsight, goal_test, self.rng)
+        hindsight = self.hindsight.after(progress)
+        steps = high_level_steps(episode, self.views, self.rules, self.reward, hindsight, goal_test, self.rng)
         self.replay.high.extend(steps.first(self.replay.high.buffer_size))  # cuts come last; a small buffer holds some
         return steps

@@ -19,6 +19,9 @@ def _idle_in_agent(config: TBCConfig) -> Iterator[str]:
     margin, end = config.reconsider_margin, config.window_end
     if end != "reconsider" and margin != 1.0:
         yield f"reconsider_margin={margin:g} has no effect: windows end by window_end={end!r}"
+    if config.hindsight_cuts_fraction != 1.0 and not config.n_hindsight_cuts:
+        share = config.hindsight_cuts_fraction
+        yield f"hindsight_cuts_fraction={share:g} has no effect: with n_hindsight_cuts=0 no episode is cut anew"
     tests = {
         "testing_penalty": config.testing_penalty is not None,
         "deterministic_testing": config.deterministic_testing,

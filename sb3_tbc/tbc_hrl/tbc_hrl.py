@@ -371,10 +371,11 @@ class TBCHRL(TwoLevelSaving):
 
     def _store(self, episodes: Iterable[Episode], goal_test: GoalTest) -> None:
         """Put finished episodes into the replay buffers; updates follow."""
+        progress = 1.0 - self._current_progress_remaining
         for episode in episodes:
             self._episode_num += 1
             self._burst_due += 1
-            self.diagnostics.add(episode, self.store.add(episode, goal_test))
+            self.diagnostics.add(episode, self.store.add(episode, goal_test, progress))
 
     def _as_sb3_names(self, step: HierarchicalStep) -> Plain:
         """What SB3's algorithms show their callbacks of a step: the task's side of it, episodes and not windows."""

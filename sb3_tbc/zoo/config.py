@@ -35,7 +35,7 @@ PARTS: dict[str, tuple[Plain, Plain]] = {
     "originals": ({"keep_original": True}, {"keep_original": False}),
     "deterministic-testing": ({"deterministic_testing": True}, {"deterministic_testing": False}),
     "dense-reward": ({"low_reward": "dense"}, {"low_reward": "sparse"}),
-    "hindsight-cuts": ({"n_hindsight_cuts": 5}, {"n_hindsight_cuts": 0}),
+    "hindsight-cuts": ({"n_hindsight_cuts": 5}, {"n_hindsight_cuts": 0, "hindsight_cuts_fraction": 1.0}),
 }
 """Part of the method -> the settings with it, and those without it; all but the last are of the paper.
 

@@ -289,6 +289,7 @@ def test_a_bonus_and_a_critic_that_cannot_be_positive_exclude_each_other(given: 
     [
         ({"low": {"policy_kwargs": {"ndbc": None}}, "memory": "window"}, "memory='window' .* is an MLP"),
         ({"reconsider_margin": 0.5}, "reconsider_margin=0.5 .* window_end='timed'"),
+        ({"hindsight_cuts_fraction": 0.3}, "hindsight_cuts_fraction=0.3 has no effect"),
         ({"testing_fraction": 0.0, "testing_penalty": -1.0}, "testing_penalty has no effect"),
         ({"testing_fraction": 0.0, "deterministic_testing": True}, "deterministic_testing has no effect"),
         (

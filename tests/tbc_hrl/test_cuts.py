@@ -45,3 +45,22 @@ def test_the_high_level_has_more_to_learn_from() -> None:
 def test_a_small_buffer_takes_as_much_of_the_cuts_as_it_holds() -> None:
     model = make(high={**LEVEL, "buffer_size": 6 * 5}, n_hindsight_cuts=20).learn(60)
     assert model.replay_buffer.high.size() == 30
+
+
+def test_cuts_end_after_their_share_of_the_training() -> None:
+    """Corridor's episodes end one by one, so that rows per option tell when cuts were made."""
+
+    def rows_in(fraction: float, steps: tuple[int, int]) -> int:
+        model, sizes = make(n_hindsight_cuts=4, hindsight_cuts_fraction=fraction), []
+
+        def note(local: Any, _: Any) -> bool:
+            sizes.append(local["replay_buffer"].high.size())
+            return True
+
+        model.learn(240, callback=note)
+        return sizes[steps[1] - 1] - sizes[steps[0] - 1]
+
+    always, early, never = (rows_in(fraction, (120, 240)) for fraction in (1.0, 0.5, 0.0))
+    assert early < always / 2
+    assert never < always / 2
+    assert rows_in(0.5, (1, 120)) == rows_in(1.0, (1, 120))
