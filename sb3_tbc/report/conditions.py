@@ -45,7 +45,7 @@ def _subgoal_view(run: Run) -> str | None:
 
 def _cuts(run: Run) -> str | None:
     """A part of our agent, and not of the others; what takes it out or puts it in differs in nothing else."""
-    own = "-cuts" in str(run.final.get("variant"))
+    own = "cuts" in str(run.final.get("variant"))
     if run.final["algo"] != OURS or run.final.get("config") == "paper" or own:
         return None
     cuts, share = int(run.settings.get("n_hindsight_cuts") or 0), run.settings.get("hindsight_cuts_fraction", 1.0)
