@@ -98,8 +98,8 @@ class AgentConfig(Settings):
     """How often a finished episode is cut anew into windows of random length. Whatever the low level did in such a
     window is one more option, in hindsight, for the high level to learn from."""
     hindsight_cuts_fraction: Fraction = 1.0
-    """Share of the training, from its beginning, in which episodes are cut anew. Cuts help most while the high level has
-    little to learn from; without them late in training, what it learns from is what it chose."""
+    """Share of the training, from its beginning, in which episodes are cut anew; later the high level learns only from
+    what it chose."""
     goal_strategy: Literal["future", "episode", "event"] = "future"
     """Where the high level's hindsight goals come from. ``future``: later options of the episode. ``episode``: any of
     its options. ``event``: the option that the task's event ended."""
