@@ -192,9 +192,9 @@ class Noting:
     def __init__(self, store: Any, episodes: list[Episode]) -> None:
         self.store, self.episodes = store, episodes
 
-    def add(self, episode: Episode, goal_test: Any) -> Any:
+    def add(self, episode: Episode, goal_test: Any, progress: float) -> Any:
         self.episodes.append(episode)
-        return self.store.add(episode, goal_test)
+        return self.store.add(episode, goal_test, progress)
 
 
 def test_an_environment_that_always_fails_ends_the_run(caplog: pytest.LogCaptureFixture) -> None:
