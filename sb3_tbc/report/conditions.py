@@ -63,6 +63,7 @@ CONDITIONS: dict[str, Callable[[Run], object]] = {
     "high level's weight averaging": _high("average_decay"),
     "hindsight cuts": _cuts,
     "settings": lambda run: run.final.get("config"),
+    "settings tried": lambda run: run.tuning_trials,
     "steps between evaluations": lambda run: run.config.get("eval_freq"),
     "episodes per evaluation": lambda run: run.config.get("n_eval_episodes"),
     "final episodes": lambda run: run.config.get("n_final_episodes", run.final.get("n_episodes")),

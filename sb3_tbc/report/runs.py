@@ -30,6 +30,8 @@ DESCRIPTIONS = "descriptions.yml"
 """File in the folder of results: task -> method -> one line; under ``default``: variant -> one line."""
 TUNING_SEEDS = "tuning_seeds.yml"
 """File in the folder of results: task -> method -> seeds on which the row's settings were chosen."""
+TUNING_TRIALS = "tuning_trials.yml"
+"""File in the folder of results: task -> method -> how many settings were tried to choose the row's."""
 
 BEGIN_ALIKE = ("Drawbridge",)
 """Tasks in which nothing is random: a deterministic agent repeats its first episode, so others tell nothing more."""
@@ -52,6 +54,7 @@ class Run(NamedTuple):
     versions: PlainMapping = MappingProxyType({})
     folder: Path = Path()
     tuned_on: bool = False  # settings of its row were chosen on this seed
+    tuning_trials: int | None = None  # settings tried to choose those of its row; unknown if not counted
 
     @property
     def method(self) -> str:
@@ -129,7 +132,7 @@ def load_results(root: Path) -> Results:
 
     Seeds on which settings were chosen are left out if their row has other seeds, because they would bias it.
 
-    :raises ConfigError: if there is no run, or one or the table of these seeds cannot be read
+    :raises ConfigError: if there is no run, or one, the table of these seeds or that of tuning trials cannot be read
     """
     if not root.is_dir():
         raise ConfigError(f"{root} is no folder; name the folder of the runs, e.g. runs, or the ledger, results")
@@ -144,9 +147,12 @@ def load_results(root: Path) -> Results:
         raise ConfigError(f"no finished runs below {root}, and {len(failed)} that failed, e.g. {failed[0]}/failed.json")
     if not results:
         raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
-    tuned = _tuning_seeds(root / TUNING_SEEDS)
+    tuned, trials = _tuning_seeds(root / TUNING_SEEDS), _tuning_trials(root / TUNING_TRIALS)
     return {
-        task: {m: _reported(methods[m], tuned.get((task, m), ())) for m in sorted(methods, key=_rank)}
+        task: {
+            m: _reported(methods[m], tuned.get((task, m), ()), trials.get((task, m)))
+            for m in sorted(methods, key=_rank)
+        }
         for task, methods in sorted(results.items())
     }
 
@@ -161,9 +167,21 @@ def _tuning_seeds(path: Path) -> dict[tuple[str, str], list[int]]:
     return {(task, method): seeds for task, rows in table.items() for method, seeds in rows.items()}
 
 
-def _reported(runs: Sequence[Run], chosen: Collection[int]) -> list[Run]:
+def _tuning_trials(path: Path) -> dict[tuple[str, str], int]:
+    for task, rows in (table := read_table(path)).items():
+        for method, count in rows.items():
+            if type(count) is not int or count < 0:
+                raise ConfigError(
+                    f"{path}: {task}, {method} must be the number of settings tried, 0 or more, "
+                    f"got {one_line(repr(count))}"
+                )
+    return {(task, method): count for task, rows in table.items() for method, count in rows.items()}
+
+
+def _reported(runs: Sequence[Run], chosen: Collection[int], trials: int | None) -> list[Run]:
     """Runs of a row in order of their seeds; seeds on which settings were chosen only if there are no others."""
-    marked = [run._replace(tuned_on=run.seed in chosen) for run in sorted(runs, key=lambda run: run.seed)]
+    ordered = sorted(runs, key=lambda run: run.seed)
+    marked = [run._replace(tuned_on=run.seed in chosen, tuning_trials=trials) for run in ordered]
     return [run for run in marked if not run.tuned_on] or marked
 
 

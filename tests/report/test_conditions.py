@@ -39,6 +39,26 @@ def test_unequal_conditions_are_named(tmp_path: Path) -> None:
     assert tables.conditions_table(results)[1][:2] == ["A", "hits"]
 
 
+def test_tuning_effort_is_a_condition(tmp_path: Path) -> None:
+    for method in ("tbc-hrl", "hits", "sac"):
+        fake_run(tmp_path, "A", method, 0, 1.0, config={"model": {}})
+    (tmp_path / "tuning_trials.yml").write_text("A: {tbc-hrl: 40, hits: 3}\n")
+    results = load_results(tmp_path)
+    assert "settings tried: 3 (40)" in unequal_conditions(results)["A"]["hits"]
+    assert not any("tried" in said for said in unequal_conditions(results)["A"].get("sac", []))  # was not counted
+    assert "settings tried: 3 (40)" in notes_of_row(results["A"]["hits"], results["A"])
+
+
+@pytest.mark.parametrize("count", ["-1", "true", "[3]", "'3'", "2.5", ""])
+def test_tuning_trials_that_are_no_number(count: str, tmp_path: Path) -> None:
+    fake_run(tmp_path, "A", "sac", 0, 1.0)
+    (tmp_path / "tuning_trials.yml").write_text(f"A:\n  sac: {count}\n")
+    with pytest.raises(
+        ConfigError, match=r"tuning_trials.yml: A, sac must be the number of settings tried, 0 or more, got "
+    ):
+        load_results(tmp_path)
+
+
 def test_defaults_are_compared_as_the_values_they_stand_for(tmp_path: Path) -> None:
     levels = {"high": {"average_decay": 0.999}, "low": {"average_decay": 0.999, "gone_since": 3}, "gradient_ratio": 1}
     fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0, config={"model": levels})
