@@ -70,6 +70,7 @@ class Row(NamedTuple):
     gain: Gain | None
     strongest: bool
     unequal: tuple[str, ...] = ()  # conditions in which the other row differs, our value in brackets
+    ours: str = OURS  # our row
 
 
 def interval_of(runs: Sequence[Run]) -> stats.Interval:
@@ -162,17 +163,20 @@ def strongest_baselines(methods: Mapping[str, Sequence[Run]]) -> list[str]:
 def _rows(results: Results, others: Mapping[str, Sequence[str]]) -> list[Row]:
     """Compare ours with named rows of each task; the p-values are corrected over all of them."""
     keys = [(task, name) for task, names in others.items() for name in names]
+    references = {(task, name): reference_of(results[task][name]) for task, name in keys}
     tests = stats.compare(
-        {key: successes(results[key[0]][reference_of(key[1])]) for key in keys},
-        {key: successes(results[key[0]][key[1]]) for key in keys},
+        {(task, name): successes(results[task][references[task, name]]) for task, name in keys},
+        {(task, name): successes(results[task][name]) for task, name in keys},
     )
     rows = []
     for task, name in keys:
-        ours, theirs = results[task][reference_of(name)], results[task][name]
+        reference = references[task, name]
+        ours, theirs = results[task][reference], results[task][name]
         gain = convergence_gain(ours, theirs, common_threshold(results[task]))
         strongest = name in strongest_baselines(results[task])
         unequal = tuple(differences(theirs, ours))
-        rows.append(Row(task, name, difference_of(ours, theirs), tests[task, name], gain, strongest, unequal))
+        difference = difference_of(ours, theirs)
+        rows.append(Row(task, name, difference, tests[task, name], gain, strongest, unequal, reference))
     return rows
 
 
@@ -182,7 +186,10 @@ def against_baselines(results: Results) -> list[Row]:
 
 
 def against_ablations(results: Results) -> list[Row]:
-    """Ours against its own ablations (table 3): of the shipped settings, and of the paper's."""
+    """Ours against its own ablations (table 3): of the shipped settings, of the paper's, and of rows that are named."""
     names = [f"{OURS} {ablation}{config}" for config in ("", OF_PAPER) for ablation in sorted(ABLATIONS)]
-    found = {t: [n for n in names if n in methods and reference_of(n) in methods] for t, methods in results.items()}
+    found = {}
+    for task, methods in results.items():
+        named = [name for name, runs in methods.items() if runs[0].compared_with and name not in names]
+        found[task] = [n for n in (*names, *named) if n in methods and reference_of(methods[n]) in methods]
     return _rows(results, found)

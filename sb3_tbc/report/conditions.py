@@ -13,6 +13,7 @@ from sb3_tbc.tasks import TASKS
 from sb3_tbc.zoo.config import load_config
 from sb3_tbc.zoo.schema import CONFIG_CLASSES
 
+CUTS = "hindsight cuts"
 TWO_LEVELS = ("tbc-hrl", "hits", "hac")
 
 
@@ -44,9 +45,8 @@ def _subgoal_view(run: Run) -> str | None:
 
 
 def _cuts(run: Run) -> str | None:
-    """A part of our agent, and not of the others; what takes it out or puts it in differs in nothing else."""
-    own = "cuts" in str(run.final.get("variant"))
-    if run.final["algo"] != OURS or run.final.get("config") == "paper" or own:
+    """A part of our agent, and not of the others."""
+    if run.final["algo"] != OURS or run.final.get("config") == "paper":
         return None
     cuts, share = int(run.settings.get("n_hindsight_cuts") or 0), run.settings.get("hindsight_cuts_fraction", 1.0)
     return f"{cuts}" if share == 1.0 or not cuts else f"{cuts} in the first {share:.0%}"
@@ -61,7 +61,7 @@ CONDITIONS: dict[str, Callable[[Run], object]] = {
     "high level's updates per step": _high("gradient_ratio"),
     "weight averaging": _low("average_decay"),
     "high level's weight averaging": _high("average_decay"),
-    "hindsight cuts": _cuts,
+    CUTS: _cuts,
     "settings": lambda run: run.final.get("config"),
     "settings tried": lambda run: run.tuning_trials,
     "steps between evaluations": lambda run: run.config.get("eval_freq"),
@@ -87,7 +87,10 @@ def differences(runs: Sequence[Run], reference: Sequence[Run]) -> list[str]:
     """Conditions in which a row differs from another, or its seeds from each other: ``name: value (other value)``."""
     found = []
     other = condition_values(reference)
+    own_part = "cuts" in runs[0].method  # what takes them out or puts them in is to differ in them
     for name, values in condition_values(runs).items():
+        if name == CUTS and own_part:
+            continue
         if len(values) > 1:
             found.append(f"{name}: {' or '.join(map(_said, values))}, depending on the seed")
         elif values and other[name] and values != other[name]:
@@ -142,7 +145,7 @@ def notes_of_row(runs: Sequence[Run], reference: Mapping[str, Sequence[Run]], fa
         with these settings
     :param failed: folders of failed runs of all rows
     """
-    other = reference_of(runs[0].method)
+    other = reference_of(runs)
     notes = differences(runs, reference[other]) if other in reference else []
     notes += _settings_notes(runs)
     if runs[0].final["task"] in BEGIN_ALIKE:

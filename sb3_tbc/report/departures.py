@@ -11,7 +11,7 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.report.comparisons import common_threshold, convergence_gain, difference_of
 from sb3_tbc.report.conditions import differences
-from sb3_tbc.report.runs import OURS, Results, Run, read_table
+from sb3_tbc.report.runs import OURS, Results, Run, read_table, reference_of
 from sb3_tbc.settings import flat
 from sb3_tbc.zoo.config import load_config
 
@@ -89,11 +89,13 @@ def _measurements(setting: str, task: str, table: Mapping[str, PlainMapping], re
 
 
 def _said(task: str, row: str, results: Results) -> str:
-    ours, theirs = _with_equal_seeds(results[task][OURS], results[task][row])
+    reference = reference_of(results[task][row])
+    ours, theirs = _with_equal_seeds(results[task][reference], results[task][row])
     gained, unequal = difference_of(ours, theirs), differences(theirs, ours)
     sooner = convergence_gain(ours, theirs, common_threshold(results[task]))
     steps = "" if sooner is None else f", steps saved: {sooner},"
     said = f"{task}: {gained.mean:+.3f} ({gained.low:+.3f} to {gained.high:+.3f}){steps} against {row}"
+    said += "" if reference == OURS else f" (ours: {reference})"
     return f"{said}, which differs in {'; '.join(unequal)}" if unequal else said
 
 

@@ -32,6 +32,8 @@ TUNING_SEEDS = "tuning_seeds.yml"
 """File in the folder of results: task -> method -> seeds on which the row's settings were chosen."""
 TUNING_TRIALS = "tuning_trials.yml"
 """File in the folder of results: task -> method -> how many settings were tried to choose the row's."""
+REFERENCES = "references.yml"
+"""File in the folder of results: task -> a row of ours -> rows that are compared with it, not with the shipped one."""
 
 BEGIN_ALIKE = ("Drawbridge",)
 """Tasks in which nothing is random: a deterministic agent repeats its first episode, so others tell nothing more."""
@@ -55,6 +57,7 @@ class Run(NamedTuple):
     folder: Path = Path()
     tuned_on: bool = False  # settings of its row were chosen on this seed
     tuning_trials: int | None = None  # settings tried to choose those of its row; unknown if not counted
+    compared_with: str | None = None  # the row of ours that its row is compared with, if not the usual one
 
     @property
     def method(self) -> str:
@@ -132,7 +135,7 @@ def load_results(root: Path) -> Results:
 
     Seeds on which settings were chosen are left out if their row has other seeds, because they would bias it.
 
-    :raises ConfigError: if there is no run, or one, the table of these seeds or that of tuning trials cannot be read
+    :raises ConfigError: if there is no run, or if one cannot be read, or a table of seeds, trials or references
     """
     if not root.is_dir():
         raise ConfigError(f"{root} is no folder; name the folder of the runs, e.g. runs, or the ledger, results")
@@ -148,11 +151,15 @@ def load_results(root: Path) -> Results:
     if not results:
         raise ConfigError(f"no finished runs below {root}: expected <task>/<algo>/<variant>/seed_<n>/final.json")
     tuned, trials = _tuning_seeds(root / TUNING_SEEDS), _tuning_trials(root / TUNING_TRIALS)
+    references = _references(root / REFERENCES, results)
+
+    def reported(task: str, method: str) -> list[Run]:
+        row = (task, method)
+        runs = _reported(results[task][method], tuned.get(row, ()))
+        return [run._replace(tuning_trials=trials.get(row), compared_with=references.get(row)) for run in runs]
+
     return {
-        task: {
-            m: _reported(methods[m], tuned.get((task, m), ()), trials.get((task, m)))
-            for m in sorted(methods, key=_rank)
-        }
+        task: {method: reported(task, method) for method in sorted(methods, key=_rank)}
         for task, methods in sorted(results.items())
     }
 
@@ -178,10 +185,26 @@ def _tuning_trials(path: Path) -> dict[tuple[str, str], int]:
     return {(task, method): count for task, rows in table.items() for method, count in rows.items()}
 
 
-def _reported(runs: Sequence[Run], chosen: Collection[int], trials: int | None) -> list[Run]:
+def _references(path: Path, results: Mapping[str, Mapping[str, object]]) -> dict[tuple[str, str], str]:
+    """Task and row -> the row of ours that it is compared with."""
+    found = {}
+    for task, references in read_table(path).items():
+        rows = results.get(task, {})
+        for reference, others in references.items():
+            if not isinstance(others, list):
+                raise ConfigError(
+                    f"{path}: {task}, {reference} must be a list of rows, as [tbc-hrl no-ts], "
+                    f"got {one_line(repr(others))}"
+                )
+            if missing := [str(row) for row in (reference, *others) if row not in rows]:
+                raise ConfigError(f"{path}: {task} has no row {', '.join(missing)}; it has {', '.join(sorted(rows))}")
+            found.update({(task, str(row)): reference for row in others})
+    return found
+
+
+def _reported(runs: Sequence[Run], chosen: Collection[int]) -> list[Run]:
     """Runs of a row in order of their seeds; seeds on which settings were chosen only if there are no others."""
-    ordered = sorted(runs, key=lambda run: run.seed)
-    marked = [run._replace(tuned_on=run.seed in chosen, tuning_trials=trials) for run in ordered]
+    marked = [run._replace(tuned_on=run.seed in chosen) for run in sorted(runs, key=lambda run: run.seed)]
     return [run for run in marked if not run.tuned_on] or marked
 
 
@@ -229,8 +252,14 @@ def shipped(methods: Mapping[str, Sequence[Run]]) -> dict[str, Sequence[Run]]:
     return {method: runs for method, runs in methods.items() if is_shipped(method)}
 
 
-def reference_of(method: str) -> str:
-    """The row of ours that a row is to be compared with: an ablation of the paper's settings with those settings."""
+def reference_of(runs: Sequence[Run]) -> str:
+    """The row of ours that a row is to be compared with: an ablation of the paper's settings with those settings.
+
+    :data:`REFERENCES` names others, for rows that were run before a setting of ours was changed.
+    """
+    if runs[0].compared_with is not None:
+        return runs[0].compared_with
+    method = runs[0].method
     algo, _, variant = method.partition(" ")
     of_paper = algo == OURS and variant.endswith(OF_PAPER)
     return f"{OURS} {SHIPPED}{OF_PAPER}" if of_paper and variant != SHIPPED + OF_PAPER else OURS

@@ -53,7 +53,9 @@ def sections(report: Report) -> list[Section]:
     found = [
         Section("Shipped settings beside the paper", tables.paper_table(results, paper), f"Paper: {paper.source}."),
         Section("Against every baseline", tables.comparison_table(against_baselines(results)), tables.COMPARISON_NOTES),
-        Section("Against our own ablations", tables.comparison_table(against_ablations(results)), ""),
+        Section(
+            "Against our own ablations", tables.comparison_table(against_ablations(results)), tables.ABLATION_NOTES
+        ),
         Section("Which of the paper's claims hold here", claims_table(results), ""),
         Section(
             "Not run under equal conditions",

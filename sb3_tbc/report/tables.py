@@ -11,7 +11,7 @@ from sb3_tbc import stats
 from sb3_tbc.report.comparisons import Row, against_ablations, against_baselines, interval_of
 from sb3_tbc.report.conditions import notes_of_row, unequal_conditions
 from sb3_tbc.report.paper import Paper
-from sb3_tbc.report.runs import OURS, Results, Run, describe, reference_of, row_of, shipped, stable_shares, successes
+from sb3_tbc.report.runs import OURS, Results, Run, describe, row_of, shipped, stable_shares, successes
 
 Table = list[list[str]]
 Descriptions = Mapping[str, Mapping[str, str]]
@@ -32,7 +32,8 @@ NOTES = (
 DEPARTURE_NOTES = (
     "Settings of tbc-hrl that differ between --config paper (its tables and text) and --config tuned (shipped). "
     "What it is worth: success of the shipped agent minus that of a row with the paper's value, with its 95 % "
-    "interval, and steps saved to the common threshold; over the seeds that both have, if there are any."
+    "interval, and steps saved to the common threshold; over the seeds that both have, if there are any. Our row is "
+    "named where the measurement was made before another setting of the shipped agent was changed."
 )
 COMPARISON_NOTES = (
     "Difference: ours minus theirs, with its 95 % interval. p: Welch's test on seeds, two-sided; (Holm): corrected "
@@ -40,6 +41,10 @@ COMPARISON_NOTES = (
     "side, nor where no seed differs from another. Better: probability that a run of ours beats one of theirs, ties "
     "counted half. Steps saved: to the common threshold, 0.9 of the best mean success of any method on the task, "
     "where that is 0.5 or more; evaluations are far apart, so small differences mean little."
+)
+ABLATION_NOTES = (
+    "As above. A note names our row where it is not the shipped agent: ablations of the paper's settings, and rows "
+    "that were run before a setting of the shipped agent was changed, are compared with ours of the same settings."
 )
 OVERALL_NOTES = (
     "Shipped settings; mean of the middle half of all runs. Tasks weigh the same, however many seeds they have; seeds "
@@ -108,8 +113,7 @@ def comparison_table(rows: Sequence[Row]) -> Table:
         gain = "-" if row.gain is None else str(row.gain)
         interval = f"{row.interval.low:+.3f} to {row.interval.high:+.3f}"
         unequal = f"unequal {'; '.join(row.unequal)}" if row.unequal else ""
-        reference = reference_of(row.other)
-        than = "" if reference == OURS else f"ours is {reference}"
+        than = "" if row.ours == OURS else f"ours is {row.ours}"
         note = ", ".join(filter(None, [than, test.note, "strongest baseline" if row.strongest else "", unequal]))
         numbers = [f"{test.difference:+.3f}", *tested, test.mark, effects[0], gain, interval, effects[1]]
         table.append([row.task, row.other, *numbers, note])

@@ -9,7 +9,7 @@ import pytest
 from made_up_runs import fake_run
 
 from sb3_tbc.errors import ConfigError
-from sb3_tbc.report.runs import DESCRIPTIONS, TUNING_SEEDS, TUNING_TRIALS, load_descriptions, load_results
+from sb3_tbc.report.runs import DESCRIPTIONS, REFERENCES, TUNING_SEEDS, TUNING_TRIALS, load_descriptions, load_results
 from sb3_tbc.zoo.ledger import to_json
 
 HEAD = "timesteps,success_rate,episodes,mean_length,subgoal_success,mean_window,wall_time\n"
@@ -69,7 +69,7 @@ def test_versions_of_later_parts_that_are_no_list(tmp_path: Path) -> None:
 
 def test_tables_of_comments_alone_are_empty(tmp_path: Path) -> None:
     fake_run(tmp_path, "A", "tbc-hrl", 0, 0.9)
-    for name in (DESCRIPTIONS, TUNING_SEEDS, TUNING_TRIALS):
+    for name in (DESCRIPTIONS, REFERENCES, TUNING_SEEDS, TUNING_TRIALS):
         (tmp_path / name).write_text("# A: {tbc-hrl: ...}\n")
     assert list(load_results(tmp_path)) == ["A"]
     assert load_descriptions(tmp_path) == {}

@@ -35,6 +35,16 @@ def test_departures_from_the_paper_come_with_their_measurement(tmp_path: Path) -
     assert not [row for row in rows if row[0] == "kappa"]  # the same in both
 
 
+def test_rows_of_former_settings_measure_against_ours_of_then(tmp_path: Path) -> None:
+    for variant, rate in (("full", 1.0), ("no-hindsight-cuts", 0.8), ("with-memory", 0.7)):
+        fake_run(tmp_path, "Pendulum", "tbc-hrl", 0, rate, variant)
+    (tmp_path / "measurements.yml").write_text("default: {tbc-hrl with-memory: [memory]}")
+    (tmp_path / "references.yml").write_text("Pendulum: {tbc-hrl no-hindsight-cuts: [tbc-hrl with-memory]}")
+    (said,) = [row[-1] for row in departures_table(tmp_path, load_results(tmp_path)) if row[0] == "memory"]
+    assert said.startswith("Pendulum: +0.100 (")
+    assert said.endswith("against tbc-hrl with-memory (ours: tbc-hrl no-hindsight-cuts)")
+
+
 @pytest.mark.parametrize("settings", ["memory_of_old", "5", ""])
 def test_measured_settings_are_a_list(settings: str, tmp_path: Path) -> None:
     """In the text, ``memory`` was found, and the row counted as its measurement; a number ended in a traceback."""

@@ -326,6 +326,51 @@ def test_ablations_of_the_papers_settings_are_compared_with_these(tmp_path: Path
     assert notes_of_row(methods["tbc-hrl full-paper"], methods) == ["updates per step: 1.0 (0.5)"]
 
 
+def test_rows_of_former_settings_are_compared_with_ours_of_then(tmp_path: Path) -> None:
+    cuts = {"model": {"n_hindsight_cuts": 5}}
+    for seed in range(3):
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 1.0, config=cuts)
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.8, "no-hindsight-cuts")
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.7, "with-rule")
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.6, "no-cuts-no-ts")
+        fake_run(tmp_path, "A", "tbc-hrl", seed, 0.9, "no-ndbc", config=cuts)
+    before = {row.other: row for row in against_ablations(load_results(tmp_path))}
+    assert before["tbc-hrl with-rule"].interval.mean == pytest.approx(0.3)
+    assert before["tbc-hrl with-rule"].unequal == ("hindsight cuts: 0 (5)",)
+    assert "tbc-hrl no-cuts-no-ts" not in before
+    rows = "tbc-hrl no-hindsight-cuts: [tbc-hrl with-rule, tbc-hrl no-cuts-no-ts, tbc-hrl no-ndbc]"
+    (tmp_path / "references.yml").write_text(f"A: {{{rows}}}\n")
+    results = load_results(tmp_path)
+    after = {row.other: row for row in against_ablations(results)}
+    assert after["tbc-hrl with-rule"].interval.mean == pytest.approx(0.1)
+    assert after["tbc-hrl with-rule"].unequal == ()
+    assert after["tbc-hrl no-cuts-no-ts"].test.difference == pytest.approx(0.2)
+    assert after["tbc-hrl no-hindsight-cuts"].interval.mean == pytest.approx(0.2)  # with the shipped agent, as before
+    assert after["tbc-hrl no-hindsight-cuts"].unequal == ()  # in what it leaves out it is to differ
+    assert after["tbc-hrl no-ndbc"].unequal == ("hindsight cuts: 5 (0)",)
+    note = tables.comparison_table([after["tbc-hrl with-rule"]])[1][-1]
+    assert note.startswith("ours is tbc-hrl no-hindsight-cuts")
+    assert notes_of_row(results["A"]["tbc-hrl with-rule"], results["A"]) == []
+
+
+@pytest.mark.parametrize(
+    ("table", "told"),
+    [
+        ("A: {tbc-hrl: sac}", r"A, tbc-hrl must be a list of rows, as \[tbc-hrl no-ts\], got 'sac'"),
+        ("A: {tbc-hrl: }", "A, tbc-hrl must be a list of rows, as .*, got None"),
+        ("A: {tbc-hrl: [tbc-hrl no-ts]}", "A has no row tbc-hrl no-ts; it has sac, tbc-hrl"),
+        ("A: {tbc-hrl other: [sac, 5]}", "A has no row tbc-hrl other, 5; it has sac, tbc-hrl"),
+        ("B: {tbc-hrl: [sac]}", "B has no row tbc-hrl, sac; it has "),
+    ],
+)
+def test_references_that_there_are_not(table: str, told: str, tmp_path: Path) -> None:
+    for algo in ("tbc-hrl", "sac"):
+        fake_run(tmp_path, "A", algo, 0, 1.0)
+    (tmp_path / "references.yml").write_text(table)
+    with pytest.raises(ConfigError, match=f"references.yml: {told}"):
+        load_results(tmp_path)
+
+
 def test_ablations_of_the_papers_settings_need_these(tmp_path: Path) -> None:
     fake_run(tmp_path, "A", "tbc-hrl", 0, 1.0)
     fake_run(tmp_path, "A", "tbc-hrl", 0, 0.4, "no-ts-paper")
