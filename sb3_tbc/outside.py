@@ -54,7 +54,7 @@ def number(value: object, what: str, low: float = -math.inf, high: float = math.
     :raises ConfigError: otherwise
     """
     if isinstance(value, bool) or not isinstance(value, int | float) or not is_finite(value):
-        raise ConfigError(f"{what} must be a finite number, got {value!r}")
+        raise ConfigError(f"{what} must be a finite number, got {one_line(repr(value), 100)}")
     if not low <= value <= high:
         raise ConfigError(f"{what} must lie in [{low:g}, {high:g}], got {value!r}")
     return float(value)
