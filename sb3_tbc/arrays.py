@@ -1,9 +1,10 @@
-"""Arrays that cross the borders between modules: their types, and how those of several parts are named together."""
+"""Numbers and arrays that cross the borders between modules: their types, and what all modules ask of them."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,14 @@ Indices = NDArray[np.intp]
 
 Arrays = dict[str, NDArray[Any]]
 """Arrays by name, as they are written to files."""
+
+
+def is_finite(number: SupportsFloat) -> bool:
+    """Whether a number is finite; a whole number beyond the largest float is not."""
+    try:
+        return math.isfinite(number)
+    except OverflowError:
+        return False
 
 
 def put_under(owner: str, arrays: Mapping[str, AnyArray]) -> Arrays:

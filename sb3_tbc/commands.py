@@ -24,6 +24,9 @@ INTERRUPTED = 130
 STANDARD_OUTPUT = Path("-")
 MOST_THREADS = 1024
 """More threads than any machine for this package has cores; torch crashes when it cannot make them all."""
+MOST_ENVS = 4096
+MOST_SEEDS = 10_000
+MOST_STEPS = 10**12
 TOLD = (ConfigError, WriteError, TrainingError, EnvironmentFault, NonFiniteError)
 """Errors whose message is all that a user needs; of others the traceback is shown."""
 
@@ -272,15 +275,26 @@ def positive_int(text: str) -> int:
     return int(value)
 
 
-def thread_count(text: str) -> int:
-    """A number of torch threads, of which a process can have only so many.
+def at_most(most: int, what: str) -> Callable[[str], int]:
+    """Arguments that are whole numbers from 1 to ``most``; more would take all memory, or years, before it fails.
 
-    :raises argparse.ArgumentTypeError: unless the number lies between 1 and :data:`MOST_THREADS`
+    :param what: what is counted, for the message
     """
-    value = positive_int(text)
-    if value > MOST_THREADS:
-        raise argparse.ArgumentTypeError(f"{text!r} is more than {MOST_THREADS} threads")
-    return value
+
+    def read(text: str) -> int:
+        value = positive_int(text)
+        if value > most:
+            raise argparse.ArgumentTypeError(f"{text!r} is more than {most} {what}")
+        return value
+
+    return read
+
+
+thread_count = at_most(MOST_THREADS, "threads")
+env_count = at_most(MOST_ENVS, "environments")
+process_count = at_most(MOST_THREADS, "processes")
+seed_count = at_most(MOST_SEEDS, "seeds")
+step_count = at_most(MOST_STEPS, "steps")
 
 
 def not_negative(text: str) -> float:

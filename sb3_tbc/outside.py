@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 
+from sb3_tbc.arrays import is_finite
 from sb3_tbc.errors import ConfigError
 
 MAX_NAME = 150
@@ -52,8 +53,8 @@ def number(value: object, what: str, low: float = -math.inf, high: float = math.
     :param what: what it is, for messages
     :raises ConfigError: otherwise
     """
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise ConfigError(f"{what} must be a finite number, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, int | float) or not is_finite(value):
+        raise ConfigError(f"{what} must be a finite number, got {one_line(repr(value), 100)}")
     if not low <= value <= high:
         raise ConfigError(f"{what} must lie in [{low:g}, {high:g}], got {value!r}")
     return float(value)

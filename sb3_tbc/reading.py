@@ -39,9 +39,11 @@ def read_text(path: Path, most: int = MAX_BYTES) -> str:
     :raises ConfigError: if it is missing, too large, or no UTF-8
     """
     try:
-        if path.stat().st_size > most:
-            raise ConfigError(f"{path} has {path.stat().st_size} bytes; at most {most} are read")
-        return path.read_text(encoding="utf-8")
+        with path.open("rb") as file:  # of a pipe or a device, as /dev/zero, no size tells how much it gives
+            content = file.read(most + 1)
+        if len(content) > most:
+            raise ConfigError(f"{path} has more than {most} bytes; at most these are read")
+        return content.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except FileNotFoundError as error:
         raise ConfigError(f"cannot read {path}: there is no such file") from error
     except UnicodeDecodeError as error:

@@ -26,7 +26,9 @@ from sb3_tbc.commands import (
     given_path,
     positive_int,
     run_command,
+    seed_count,
     seed_number,
+    step_count,
     stop_like_ctrl_c,
 )
 from sb3_tbc.errors import ConfigError
@@ -64,7 +66,7 @@ def build_parser() -> Parser:
     add = parser.add_argument_group("which runs").add_argument
     add("--tasks", action=Several, default=sorted(task_names()), help="by default all of them")
     add("--algos", action=Several, default=sorted(ALGORITHMS), help="by default all of them: hac, hits, sac, tbc-hrl")
-    add("--seeds", type=positive_int, default=10, help="seeds of each task and method; the paper has 10")
+    add("--seeds", type=seed_count, default=10, help="seeds of each task and method; the paper has 10")
     add("--first-seed", type=seed_number, default=0, help="the first seed; the others are the numbers that follow it")
     add(
         "--config",
@@ -80,7 +82,7 @@ def build_parser() -> Parser:
         "needs --algos tbc-hrl")  # fmt: skip
     add("--variant", help="name of the runs' folder; by default as in sb3_tbc.train")
     add("--hyperparams", action=Several, default=[], metavar="NAME:VALUE", help="single settings, as in sb3_tbc.train")
-    add("--n-timesteps", type=positive_int, help="environment steps of each run; by default the task's")
+    add("--n-timesteps", type=step_count, help="environment steps of each run; by default the task's")
     add("--eval-freq", type=positive_int, help="steps between evaluations; by default a fortieth of the run")
     add("--n-eval-episodes", type=positive_int, help=f"episodes of each evaluation (default: {N_EVAL_EPISODES})")
     add("--n-final-episodes", type=positive_int, default=100, help="episodes of the evaluation after training")

@@ -18,12 +18,14 @@ from sb3_tbc.commands import (
     Parser,
     Several,
     add_trust,
+    env_count,
     given_path,
     not_negative,
     positive_int,
     python,
     run_command,
     seed_number,
+    step_count,
     thread_count,
 )
 from sb3_tbc.errors import ConfigError
@@ -73,8 +75,8 @@ def build_parser() -> Parser:
     what.add_argument("--algo", default="tbc-hrl", help="tbc-hrl, hits, hac or sac")
     what.add_argument("--env", default="Pendulum", help="a task's name or the id of any registered goal environment")
     what.add_argument("--seed", type=seed_number, default=0, help="seed of everything random in the run")
-    what.add_argument("--n-timesteps", type=positive_int, help="environment steps; by default the task's, see --list")
-    what.add_argument("--n-envs", type=positive_int, help="environments side by side; by default the configuration's")
+    what.add_argument("--n-timesteps", type=step_count, help="environment steps; by default the task's, see --list")
+    what.add_argument("--n-envs", type=env_count, help="environments side by side; by default the configuration's")
     what.add_argument("--config", metavar="{paper,tuned,FILE.yml}", help="paper: the values of the paper's tables; "
                       "tuned: values that did better in measurements, the default for tasks that have them; or a file "
                       "with sections like those of zoo_configs")  # fmt: skip

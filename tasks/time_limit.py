@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numbers import Real
+
 import gymnasium as gym
 from gymnasium.wrappers import TimeLimit
 
@@ -17,6 +19,7 @@ def time_limit(env: Env) -> int | None:
 
     :param env: an environment with any wrappers
     :return: None if there is no limit
+    :raises ValueError: if an environment's ``max_episode_steps`` is no number of steps
     """
     limits: list[int | None] = []
     layer = env
@@ -24,7 +27,7 @@ def time_limit(env: Env) -> int | None:
         limits.append(layer._max_episode_steps if isinstance(layer, TimeLimit) else None)
         layer = layer.env
     declared = [limit for limit in limits if limit]
-    own = getattr(layer, "max_episode_steps", None)
+    own = _checked(getattr(layer, "max_episode_steps", None))
     if own and (getattr(layer, "truncates_itself", True)):
         declared.append(own)
     return int(min(declared)) if declared else getattr(env.spec, "max_episode_steps", None)
@@ -38,5 +41,17 @@ def declared_limit(spec: object, own: int | None, truncates_itself: bool) -> int
     :param truncates_itself: false where it leaves its own limit to a wrapper
     """
     declared = getattr(spec, "max_episode_steps", None)
+    own = _checked(own)
     limits = [limit for limit in (declared, own if truncates_itself or declared is None else None) if limit]
     return int(min(limits)) if limits else None
+
+
+def _checked(own: object) -> int | None:
+    """An environment's own ``max_episode_steps``, where 0 and None stand for no limit."""
+    if own is None:
+        return None
+    if isinstance(own, bool) or not isinstance(own, Real) or not own >= 0 or own % 1 != 0:
+        raise ValueError(
+            f"the environment's max_episode_steps must be a whole number of steps, or None for no limit, got {own!r}"
+        )
+    return int(own)

@@ -17,7 +17,7 @@ from test_cli import said
 
 from sb3_tbc import __main__, evaluate, train
 from sb3_tbc.benchmark import command as benchmark
-from sb3_tbc.commands import COMMANDS, Parser, given_path, output_file, python, run_command, thread_count
+from sb3_tbc.commands import COMMANDS, Parser, given_path, output_file, python, run_command
 from sb3_tbc.export import command as export
 from sb3_tbc.extras import MissingExtraError, require
 from sb3_tbc.ndbc.wiring import NDBCWiring
@@ -319,8 +319,24 @@ def test_paths_begin_at_home_and_can_be_looked_at(tmp_path: Path, monkeypatch: p
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(argparse.ArgumentTypeError, match=r"cannot use xxx.*too long"):
         given_path("x" * 300)
-    with pytest.raises(argparse.ArgumentTypeError, match="more than 1024 threads"):
-        thread_count("1e8")
+
+
+@pytest.mark.parametrize(
+    ("command", "what"),
+    [
+        (["train", "--num-threads", "1e8"], "1024 threads"),
+        (["train", "--n-envs", "1e12"], "4096 environments"),
+        (["train", "--n-timesteps", "1e15"], "1000000000000 steps"),
+        (["tune", "--workers", "1e9"], "1024 processes"),
+        (["tune", "--n-envs", "4097"], "4096 environments"),
+        (["reproduce", "--seeds", "1e9"], "10000 seeds"),
+    ],
+)
+def test_numbers_that_no_machine_can_serve_are_refused(command: list[str], what: str, capsys: Any) -> None:
+    with pytest.raises(SystemExit) as stop:
+        import_module(COMMANDS[command[0]].module).main(command[1:])
+    assert stop.value.code == 2
+    assert f"{command[2]!r} is more than {what}" in said(capsys)
 
 
 def test_a_place_without_permission_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

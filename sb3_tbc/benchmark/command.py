@@ -7,7 +7,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sb3_tbc.aliases import Plain
-from sb3_tbc.commands import Parser, Several, add_trust, output_file, positive_int, run_command, seed_number
+from sb3_tbc.commands import (
+    Parser,
+    Several,
+    add_trust,
+    env_count,
+    output_file,
+    positive_int,
+    run_command,
+    seed_number,
+)
 from sb3_tbc.extras import require
 from sb3_tbc.files import write_atomic
 from sb3_tbc.pretrained import model_path
@@ -104,7 +113,7 @@ def _add_train(commands: Commands) -> None:
                        "split and update")  # fmt: skip
     train.add_argument("--config", choices=CONFIGS, help="values of the task's settings; by default tuned, for tasks "
                        "that have them")  # fmt: skip
-    train.add_argument("--n-envs", type=positive_int, help="parallel environments in split; by default the "
+    train.add_argument("--n-envs", type=env_count, help="parallel environments in split; by default the "
                        "configuration's")  # fmt: skip
     train.add_argument("--steps", type=positive_int, default=2000, help="environment steps of one measurement")
     train.add_argument("--rounds", type=positive_int, default=5, help="measurements of each contender, in turns")

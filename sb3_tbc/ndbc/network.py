@@ -18,7 +18,7 @@ from sb3_tbc.ndbc.dissipative import Certificate, DissipativeCell
 from sb3_tbc.ndbc.lean import LeanCell
 from sb3_tbc.ndbc.sequence import Unrolled, unroll
 from sb3_tbc.ndbc.stepping import LipschitzProxy, StepRule, advance_checked
-from sb3_tbc.ndbc.wiring import NDBCWiring
+from sb3_tbc.ndbc.wiring import NDBCWiring, check_seed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,11 +80,11 @@ class NDBCNet(nn.Module):
     ) -> None:
         super().__init__()
         wiring = wiring if isinstance(wiring, NDBCWiring) else NDBCWiring.from_dict(wiring)
-        _check_sizes(n_inputs, n_outputs, wiring, sub_steps)
+        _check_sizes(n_inputs, n_outputs, wiring, sub_steps, seed)
         only_conductance = {"time_constants": time_constants, "initial_gains": initial_gains}
         _check_options(dynamics, readout, max_rho, synapses, only_conductance)
         scale = th.ones(n_inputs) if input_scale is None else th.as_tensor(input_scale, dtype=th.float32).clone()
-        if scale.shape != (n_inputs,) or not bool((scale > 0).all()):
+        if scale.shape != (n_inputs,) or not bool((scale.isfinite() & (scale > 0)).all()):
             raise ValueError(f"input_scale must be {n_inputs} positive numbers, got {input_scale}")
         generator = None if seed is None else th.Generator().manual_seed(seed)
         self.n_inputs, self.n_outputs, self.sub_steps, self.wiring = n_inputs, n_outputs, int(sub_steps), wiring
@@ -157,8 +157,9 @@ class NDBCNet(nn.Module):
             0 leaves the potentials as they are
         :return: outputs ``(batch, n_outputs)`` or ``(batch, time, n_outputs)``, and the final potentials
         :raises ValueError: if a shape does not fit or an interval is negative
+        :raises TypeError: for what is no tensor, or of a type that the network's own does not hold
         """
-        if inputs.dim() == 2:
+        if isinstance(inputs, th.Tensor) and inputs.dim() == 2:
             state = self._advance(inputs, state, mask, interval)
             return self.read(state), state
         fast = self._unroll_fast(inputs, state, mask, interval)
@@ -235,6 +236,9 @@ class NDBCNet(nn.Module):
     def _check_shapes(
         self, inputs: th.Tensor, state: th.Tensor | None, mask: th.Tensor | None, interval: th.Tensor | None, dims: int
     ) -> None:
+        for name, value in (("inputs", inputs), ("state", state), ("mask", mask), ("interval", interval)):
+            if value is not None:
+                _check_tensor(name, value, None if name == "mask" else self.input_gain.dtype)
         lead = tuple(inputs.shape[:-1])
         if inputs.dim() != dims or inputs.shape[-1] != self.n_inputs:
             raise ValueError(f"inputs must be (batch, [time,] {self.n_inputs}), got shape {tuple(inputs.shape)}")
@@ -350,12 +354,27 @@ def _after_loading(net: NDBCNet, _: object) -> None:
     net.lipschitz.direction.copy_(direction)
 
 
-def _check_sizes(n_inputs: int, n_outputs: int, wiring: NDBCWiring, sub_steps: int) -> None:
+def _check_tensor(name: str, value: object, own: th.dtype | None) -> None:
+    """Refuse what is no tensor, or of a type that the network's own does not hold.
+
+    :param own: None where any type will do
+    :raises TypeError: with the cure
+    """
+    if not isinstance(value, th.Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(value).__name__}: torch.as_tensor(...) makes one")
+    if own is not None and th.promote_types(value.dtype, own) != own:
+        raise TypeError(
+            f"{name} is of {value.dtype}, the network of {own}: use {name}.to({own}), or net.to({value.dtype})"
+        )
+
+
+def _check_sizes(n_inputs: int, n_outputs: int, wiring: NDBCWiring, sub_steps: int, seed: int | None) -> None:
     if n_inputs != wiring.n_inputs:
         raise ValueError(f"n_inputs={n_inputs}, but the wiring has {wiring.n_inputs} sensory neurons")
     for name, value in (("n_outputs", n_outputs), ("sub_steps", sub_steps)):
         if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
             raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+    check_seed(seed)
 
 
 def _check_options(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import logging
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,6 +66,7 @@ class NDBCWiring:
         self._set_sizes(n_inputs, inter, command, motor, sensory_to=sensory_to)
         self.seed = seed
         self.notes: tuple[str, ...] = ()
+        check_seed(seed)
         rng = np.random.default_rng(seed)
         sensory_fanout = self._clip("sensory_fanout", sensory_fanout, inter, "inter neurons")
         inter_fanout = self._clip("inter_fanout", inter_fanout, command, "command neurons")
@@ -93,7 +94,7 @@ class NDBCWiring:
         self, n_inputs: int, inter: int, command: int, motor: int, *, sensory_to: Sequence[str] = ("inter",)
     ) -> None:
         for name, size in {"n_inputs": n_inputs, "inter": inter, "command": command, "motor": motor}.items():
-            if not isinstance(size, int | np.integer) or not 1 <= size <= MOST_NEURONS:
+            if not _is_whole(size) or not 1 <= size <= MOST_NEURONS:
                 raise ValueError(f"{name} must be a whole number from 1 to {MOST_NEURONS}, got {size!r}")
         self.n_inputs, self.inter, self.command, self.motor = int(n_inputs), int(inter), int(command), int(motor)
         self.sensory_to = (sensory_to,) if isinstance(sensory_to, str) else tuple(sensory_to)
@@ -103,7 +104,7 @@ class NDBCWiring:
             raise ValueError(f"sensory_to must be one of {listed}, got {sensory_to!r}")
 
     def _clip(self, name: str, fan: int, limit: int, of_what: str, least: int = 1) -> int:
-        if not isinstance(fan, int | np.integer) or fan < least:
+        if not _is_whole(fan) or fan < least:
             raise ValueError(f"{name} must be a whole number of at least {least}, got {fan!r}")
         if fan > limit:
             note = f"{name}={fan} exceeds the {limit} {of_what}: clipped to {limit}"
@@ -268,6 +269,19 @@ class NDBCWiring:
 
 WIRING_KEYS = tuple(inspect.signature(NDBCWiring).parameters)[1:]
 """What a wiring takes besides its number of inputs; other settings of a circuit are the network's."""
+
+
+def check_seed(seed: object) -> None:
+    """Refuse what NumPy or torch would refuse without naming it.
+
+    :raises ValueError: unless it is a whole number of at least 0, or None
+    """
+    if seed is not None and (not _is_whole(seed) or seed < 0):
+        raise ValueError(f"seed must be a whole number of at least 0, or None, got {seed!r}")
+
+
+def _is_whole(value: object) -> TypeGuard[int]:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
 
 
 def _fan_out(rng: np.random.Generator, sources: int, targets: int, fan: int, rescue: bool = True) -> NDArray[np.bool_]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import pathlib
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -17,6 +17,7 @@ from stable_baselines3.common.policies import BaseModel, BasePolicy, ContinuousC
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.sac.policies import Actor, SACPolicy
 
 from sb3_tbc.aliases import Plain, PlainMapping, Space
@@ -25,7 +26,11 @@ from sb3_tbc.errors import ConfigError
 from sb3_tbc.ndbc.extractor import input_scale_of
 from sb3_tbc.recurrent.cells import NDBCCell, make_cell
 from sb3_tbc.recurrent.sequences import SequenceReplayBuffer, Sequences, flat, flat_space, refuse_non_finite
+from sb3_tbc.settings import Range, hints, read_partial
+from sb3_tbc.smdp.goal_spaces import box_problems
+from sb3_tbc.tbc_hrl.arguments import SB3Arguments
 from sb3_tbc.tbc_hrl.checks import episode_starts
+from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.last_step import KeepsLastStep
 from sb3_tbc.tbc_hrl.saving import PlainAlgorithm
 
@@ -33,6 +38,20 @@ State = tuple[AnyArray, ...]
 """Memory ``(n_envs, state_dim)`` and last action in [-1, 1], ``(n_envs, action_dim)``."""
 NOT_TAKEN: Plain = {"use_sde": False, "optimize_memory_usage": False, "n_steps": 1}
 """Parameters of SAC that have no meaning here, and the only value that each may have."""
+
+SETTINGS: Plain = {
+    **{
+        name: hints(FlatConfig)[name]
+        for name in ("batch_size", "gamma", "tau", "ent_coef", "target_entropy", "buffer_size", "learning_starts")
+    },
+    **{name: hints(SB3Arguments)[name] for name in ("seed", "verbose", "stats_window_size")},
+    "learning_rate": Annotated[float, Range(0)],
+    "gradient_steps": Annotated[int, Range(-1)],
+    "target_update_interval": Annotated[int, Range(1)],
+}
+"""Parameters of SAC that SB3 takes as they are given, and what each may be; a learning rate may also be a function."""
+MEMORY_SETTINGS: Plain = {"hidden_size": Annotated[int, Range(1, 16_384)], "n_critics": Annotated[int, Range(1, 1000)]}
+"""Likewise of its policy."""
 
 NO_EXTRACTOR: Plain = {
     "share_features_extractor": False,
@@ -129,6 +148,8 @@ class RecurrentSACPolicy(SACPolicy):
         critic_cell: str = "gru",
         **kwargs: Any,
     ) -> None:
+        given = {"hidden_size": hidden_size, **kwargs}
+        read_partial({name: given[name] for name in MEMORY_SETTINGS if name in given}, MEMORY_SETTINGS, "policy_kwargs")
         for name, default in NO_EXTRACTOR.items():
             if kwargs.get(name, default) not in (default, None, {}):
                 raise ConfigError(
@@ -174,7 +195,7 @@ class RecurrentSACPolicy(SACPolicy):
         :param episode_start: ``(n_envs,)``, in which environments an episode begins; by default in none
         :param deterministic: the squashed mean in place of a sample
         :raises ValueError: if observation or state do not fit
-        :raises NonFiniteError: if an observation is NaN or infinite
+        :raises NonFiniteError: if observation or state are NaN or infinite
         """
         self.set_training_mode(False)
         flat_observation = self._flat(observation)
@@ -183,6 +204,8 @@ class RecurrentSACPolicy(SACPolicy):
         if episode_start is not None:
             fresh = episode_starts(episode_start, len(memory))[:, None]
             memory, last_action = np.where(fresh, 0.0, memory), np.where(fresh, 0.0, last_action)
+        refuse_non_finite("memory", memory)
+        refuse_non_finite("last action", last_action)
         inputs = np.concatenate([flat_observation, last_action], axis=1, dtype=np.float32)
         unit, memory = self._act(inputs, memory.astype(np.float32), deterministic)
         actions = self.unscale_action(unit.reshape(-1, *(self.action_space.shape or ())))
@@ -280,7 +303,8 @@ class NDBCSAC(PlainAlgorithm, KeepsLastStep, SAC):
         replay_buffer_class: type[ReplayBuffer] | None = SequenceReplayBuffer,
         **kwargs: Any,
     ) -> None:
-        self._refuse({**kwargs, "replay_buffer_class": replay_buffer_class})
+        own = {"learning_rate": learning_rate, "batch_size": batch_size, "replay_buffer_class": replay_buffer_class}
+        self._refuse({**kwargs, **own})
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -299,6 +323,7 @@ class NDBCSAC(PlainAlgorithm, KeepsLastStep, SAC):
         for name, default in NOT_TAKEN.items():
             if given.get(name, default) != default:
                 raise ConfigError(f"NDBCSAC has no {name}; leave it at its default, {default}")
+        read_partial({name: given[name] for name in SETTINGS if name in given and not callable(given[name])}, SETTINGS)
         buffer = given.get("replay_buffer_class", SequenceReplayBuffer)
         if buffer is None or not issubclass(buffer, SequenceReplayBuffer):
             raise ConfigError(
@@ -309,6 +334,21 @@ class NDBCSAC(PlainAlgorithm, KeepsLastStep, SAC):
     def _changes(cls, given: PlainMapping, data: PlainMapping) -> Plain:
         cls._refuse(given)
         return super()._changes({name: value for name, value in given.items() if name not in NOT_TAKEN}, data)
+
+    @staticmethod
+    def _wrap_env(env: GymEnv, verbose: int = 0, monitor_wrapper: bool = True) -> VecEnv:
+        """A vector of environments, see SB3.
+
+        :raises ConfigError: for actions that a squashed Gaussian cannot give
+        """
+        venv = SAC._wrap_env(env, verbose, monitor_wrapper)
+        actions = venv.action_space
+        problems = box_problems(actions) if isinstance(actions, spaces.Box) else []
+        if not problems and isinstance(actions, spaces.Box) and not (actions.low < actions.high).all():
+            problems = [f"its lowest actions must be below its highest, got {actions}: leave out what never changes"]
+        if problems:
+            raise ConfigError(f"NDBCSAC cannot act in this environment: {problems[0]}")
+        return venv
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self._vec_normalize_env is not None and isinstance(self.observation_space, spaces.Dict):
@@ -328,7 +368,12 @@ class NDBCSAC(PlainAlgorithm, KeepsLastStep, SAC):
         if self.num_timesteps < learning_starts:
             unit = self.policy.scale_action(np.array([self.action_space.sample() for _ in range(n_envs)]))
         if action_noise is not None:
-            unit = unit.reshape(n_envs, -1) + action_noise().reshape(n_envs, -1)
+            unit = unit.reshape(n_envs, -1)
+            noise = np.asarray(action_noise(), dtype=np.float32)
+            if noise.size != unit.size:
+                raise ConfigError(f"action_noise must give {unit.size} numbers, one for each action, got {noise.size}")
+            refuse_non_finite("action noise", noise.reshape(unit.shape))
+            unit = unit + noise.reshape(unit.shape)
         unit = np.clip(unit, -1.0, 1.0).astype(np.float32)
         self._state = memory, unit.reshape(n_envs, -1)
         return self.policy.unscale_action(unit.reshape(actions.shape)), unit

@@ -105,6 +105,8 @@ class SequenceReplayBuffer(ReplayBuffer):
         burn_in: int = 8,
         **kwargs: Any,
     ) -> None:
+        if not all(isinstance(number, int | np.integer) for number in (burn_in, sequence_length)):
+            raise ConfigError(f"burn_in and sequence_length are whole numbers, got {burn_in!r} and {sequence_length!r}")
         if not 0 <= burn_in < sequence_length:
             raise ConfigError(f"need 0 <= burn_in < sequence_length, got {burn_in} and {sequence_length}")
         self.given_space = observation_space

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 import numbers
 import types
 import typing
@@ -12,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import is_finite
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.settings.kinds import Section, allows_anything, allows_none, arms, default_of, hints, section_of, split
 from sb3_tbc.settings.texts import describe, remark, section_text
@@ -196,7 +196,7 @@ def _read_plain(value: object, kind: object, name: str) -> object:
 
 def _read_number(value: object, whole: bool) -> object:
     """Numbers keep their type, except whole floats where an integer is wanted (YAML's ``1e3``)."""
-    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, numbers.Real) or not is_finite(value):
         return _WRONG
     if not isinstance(value, int | float):
         value = value.item() if hasattr(value, "item") else float(value)  # NumPy's

@@ -118,7 +118,7 @@ class EpisodeLimit(Wrapper, RecordConstructorArgs):
             observation, reward, terminated, truncated, info = self.env.step(action)
         except Exception as error:  # a task's own code may fail in any way
             raise fault(self.index, self._steps, error) from error
-        wrong = self._wrong(observation, info, reward)
+        wrong = self._wrong(observation, info, reward, terminated, truncated)
         if wrong is not None:
             return self._blank(), 0.0, False, False, {BAD_STEP: wrong, RESETS: self._resets}
         info = {**info, RESETS: self._resets}
@@ -130,13 +130,23 @@ class EpisodeLimit(Wrapper, RecordConstructorArgs):
             observation = {key: np.array(part) for key, part in observation.items()}
         return observation, reward, terminated, truncated, info
 
-    def _wrong(self, observation: object, info: object, reward: object = 0.0) -> str | None:
+    def _wrong(
+        self,
+        observation: object,
+        info: object,
+        reward: object = 0.0,
+        terminated: object = False,
+        truncated: object = False,
+    ) -> str | None:
         """What is not as it was declared; None if all is."""
         found = wrong_shape(observation, self._shapes)
         if found is None and not isinstance(info, dict):
             found = f"info must be a dictionary, got {info!r}"
         if found is None and not _is_number(reward):
             found = f"its reward must be a number, got {one_line(repr(reward), 100)}"
+        for name, value in (("terminated", terminated), ("truncated", truncated)):
+            if found is None and not _is_flag(value):  # a text or NaN would count as true, and end the episode
+                found = f"{name} must be True or False, got {one_line(repr(value), 100)}"
         return found
 
     def _blank(self) -> Plain:
@@ -153,6 +163,10 @@ def _is_number(value: object) -> bool:
     return isinstance(value, float | int | np.floating | np.integer) or (
         isinstance(value, np.ndarray) and value.size == 1 and value.dtype.kind in "fiub"
     )
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool | np.bool_) or (_is_number(value) and bool(value in (0, 1)))
 
 
 class LimitingVecEnv(CopyableVecEnvWrapper):

@@ -37,6 +37,11 @@ def goal_space_problems(observation: Space, action: Space | None = None) -> list
 def _action_problems(action: Space) -> list[str]:
     if not isinstance(action, spaces.Box) or len(action.shape) != 1:
         return [f"its actions must be a Box action space with one dimension, got {action}"]
+    return box_problems(action)
+
+
+def box_problems(action: spaces.Box) -> list[str]:
+    """What keeps a Gaussian policy from acting in a box of actions, one sentence for each problem, "its ..."."""
     if action.dtype.kind != "f":  # cast to the space's type, all but the highest unit action would lose its fraction
         return [
             f"its actions must be real numbers, got {action}: an agent's actions lie anywhere between the bounds; "

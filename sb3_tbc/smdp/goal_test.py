@@ -7,11 +7,13 @@ from copy import deepcopy
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.arrays import AnyArray, BoolArray, FloatArray
 from sb3_tbc.errors import ConfigError, NonFiniteError
+from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS, check_goal_space, goal_space_problems, said_success
 from sb3_tbc.smdp.hindsight import GoalTest
 
@@ -48,12 +50,21 @@ def goal_test_of(venv: VecEnv) -> GoalTest:
     def as_good_as_the_goal(achieved: FloatArray, desired: FloatArray) -> BoolArray:
         return np.asarray(reward(achieved, desired) >= reward(desired, desired))
 
+    def flags(answers: ArrayLike) -> BoolArray:
+        array = np.asarray(answers)
+        if array.dtype != np.bool_ and not (array.dtype.kind in "iuf" and np.isin(array, (0, 1)).all()):
+            raise ConfigError(
+                "compute_terminated(achieved_goal, desired_goal, info) must give True or False for each goal, got "
+                f"{one_line(array.tolist(), 100)}"
+            )
+        return array.astype(bool)
+
     def terminated(achieved: FloatArray, desired: FloatArray) -> BoolArray:
         answer = venv.env_method("compute_terminated", achieved, desired, {}, indices=[0])[0]
         if np.shape(answer) == ():  # the mazes of Gymnasium-Robotics take one pair at a time
             pairs = zip(achieved, desired, strict=True)
-            return np.array([venv.env_method("compute_terminated", a, d, {}, indices=[0])[0] for a, d in pairs], bool)
-        return ask("compute_terminated", achieved, desired).astype(bool)
+            return flags([venv.env_method("compute_terminated", a, d, {}, indices=[0])[0] for a, d in pairs])
+        return flags(ask("compute_terminated", achieved, desired))
 
     return GoalTest(reward, terminated if venv.has_attr("compute_terminated") else as_good_as_the_goal)
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import enum
 import math
 from dataclasses import dataclass
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
 
 from sb3_tbc.aliases import Plain
 from sb3_tbc.arrays import Arrays, BoolArray, FloatArray, Indices, IntArray
+from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.smdp.goal_spaces import GOAL_KEYS
 from sb3_tbc.smdp.spaces import GoalObservation, SubgoalSpace
 
@@ -63,8 +65,10 @@ class OptionRules:
             )
         if self.dt_max < 1.0:
             raise ValueError(f"dt_max must allow at least one environment step, got {self.dt_max}; lower max_options?")
-        if self.max_options < 1:
-            raise ValueError(f"max_options must be at least 1, got {self.max_options}")
+        if math.isinf(self.dt_max):
+            raise ValueError("dt_max must be a finite number of environment steps: time budgets are shares of it")
+        if isinstance(self.max_options, bool) or not isinstance(self.max_options, Integral) or self.max_options < 1:
+            raise ValueError(f"max_options must be a whole number of at least 1, got {self.max_options!r}")
         if self.window_end not in WINDOW_ENDS:
             raise ValueError(f"window_end must be one of {', '.join(map(repr, WINDOW_ENDS))}, got {self.window_end!r}")
 
@@ -202,7 +206,17 @@ class OptionClock:
 
         :param unit_action: subgoal and time budget in [-1, 1], one row per index
         :param testing: whether the option is a subgoal test
+        :raises ValueError: for another number of rows or columns, which NumPy might spread over all environments
+        :raises NonFiniteError: for NaN, whose window would never end
         """
+        n, width = len(indices), self.unit_action.shape[1]
+        if np.shape(unit_action) != (n, width) or np.shape(testing) not in ((), (n,)):
+            raise ValueError(
+                f"{n} options need unit actions ({n}, {width}), subgoal and time budget, and testing ({n},); got "
+                f"{np.shape(unit_action)} and {np.shape(testing)}"
+            )
+        if not np.isfinite(unit_action).all():
+            raise NonFiniteError(f"the high level's subgoals and time budgets are not finite: {unit_action.tolist()}")
         self.unit_action[indices] = unit_action
         self.subgoal[indices] = self.subgoals.unscale(unit_action[:, :-1])
         self.time_budget[indices] = self.rules.budget(unit_action[:, -1])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -135,19 +136,29 @@ class SubgoalSpace:
         return _restored(type(self), vars(self))
 
     def _check(self) -> None:
-        if self.low.ndim != 1 or self.low.shape != self.high.shape or not np.all(self.low < self.high):
+        bounds = self.low.ndim == 1 and self.low.shape == self.high.shape and bool(np.all(self.low < self.high))
+        if not bounds or not np.isfinite([self.low, self.high]).all():
             raise ValueError(
-                f"subgoal bounds must be two vectors with low < high, got low={self.low}, high={self.high}"
+                f"subgoal bounds must be two vectors of finite numbers with low < high, got low={self.low}, "
+                f"high={self.high}"
+            )
+        if self.local_scale.ndim != 1 or not (np.isfinite(self.local_scale) & (self.local_scale > 0)).all():
+            raise ValueError(
+                "local_scale must be a vector of finite numbers above 0, one for each entry that the low level sees, "
+                f"got {self.local_scale}"
             )
         if len(self.names) != self.dim:
             raise ValueError(f"{self.dim} subgoal coordinates need as many names, got {self.names}")
         if self.thresholds.shape != (len(self.groups),) or not np.all(self.thresholds > 0):
             raise ValueError(f"need one positive threshold per group {self.groups}, got {self.thresholds}")
-        if self.event is not None and (not isinstance(self.event, int) or self.event < 0):
+        if self.event is not None and (type(self.event) is not int or self.event < 0):
             raise ValueError(
                 f"event must be the index of a flag in the observation, counted from 0, got {self.event!r}"
             )
-        if not all(self.groups) or sorted(i for g in self.groups for i in g) != list(range(self.dim)):
+        used = [i for group in self.groups for i in group]
+        if not all(isinstance(i, Integral) for i in (*used, *self.rotations)):
+            raise ValueError(f"groups and rotations must hold whole numbers, got {self.groups} and {self.rotations}")
+        if not all(self.groups) or sorted(used) != list(range(self.dim)):
             raise ValueError(f"groups must use each of the {self.dim} coordinates once, got {self.groups}")
         for index in self.rotations:
             if not 0 <= index < len(self.groups) or len(self.groups[index]) != 4:
@@ -226,6 +237,11 @@ class SubgoalSpace:
         """
         if not isinstance(space, spaces.Dict):
             return
+        width = int(np.prod(space["observation"].shape or ()))
+        if self.event is not None and self.event >= width:
+            raise ValueError(
+                f"event is the index of a flag in the observation, which has {width} entries; got {self.event}"
+            )
         for name, size in (("achieved", self.dim), ("local", self.local_dim)):
             if (found := self._shape_from(name, space)) != (size,):
                 raise ValueError(

@@ -8,13 +8,17 @@ import json
 import os
 import re
 import zipfile
+from collections import deque
 from pathlib import Path
 
+from gymnasium import spaces
+from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.save_util import json_to_data
 
-from sb3_tbc.aliases import Plain
+from sb3_tbc.aliases import Plain, PlainMapping
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
+from sb3_tbc.smdp.spaces import SubgoalSpace
 from sb3_tbc.tbc_hrl.plain import NotPlainError, decode
 
 DATA, PLAIN_DATA = "data", "plain.json"
@@ -27,6 +31,26 @@ MAX_DATA = 64 * 2**20
 MAX_GROWTH = 20
 SMALL = 2**20
 """Most bytes that a file may unpack to: ``MAX_GROWTH`` times its size plus ``SMALL``; SB3 does not compress at all."""
+NEEDED = ("observation_space", "action_space", POLICY)
+KINDS: dict[str, tuple[type, ...]] = {
+    **dict.fromkeys(("observation_space", "action_space"), (spaces.Space,)),
+    **dict.fromkeys(
+        ("num_timesteps", "_total_timesteps", "_num_timesteps_at_start", "_episode_num", "_n_updates"), (int,)
+    ),
+    **dict.fromkeys(
+        ("_updated_at", "_burst_due", "_stats_window_size", "n_envs", "verbose", "sde_sample_freq"), (int,)
+    ),
+    **dict.fromkeys(("_current_progress_remaining", "start_time"), (int, float)),
+    **dict.fromkeys(("use_sde", "achieved_in_observation"), (bool,)),
+    **dict.fromkeys(("seed", "episode_length"), (int, type(None))),
+    **dict.fromkeys(("ep_info_buffer", "ep_success_buffer"), (deque, type(None))),
+    **dict.fromkeys(("policy_kwargs", "settings"), (dict,)),
+    "_owed": (dict, int, float),
+    "tensorboard_log": (str, type(None)),
+    "action_noise": (ActionNoise, type(None)),
+    "subgoals": (SubgoalSpace, type(None)),
+}
+"""Entries of ``data`` that loading takes over as they stand, and what each may be."""
 NAME = re.compile(r"[A-Za-z_][\w.]*")
 
 
@@ -165,6 +189,23 @@ def unpickled(data: Plain, name: str, given: Plain, has_env: bool) -> Plain:
             text = f"{name}: {one_line(key)} in {PLAIN_DATA} makes no sense here: {one_line(error)}"
             raise UntrustedError(f"{text}; {CURE}") from error
     return values
+
+
+def check_entries(found: PlainMapping, name: str) -> None:
+    """Check what loading takes over from a file as it stands.
+
+    :param found: entries of ``data`` by name; those that are still pickled are not looked at
+    :param name: of the file, for messages
+    :raises ConfigError: if one is missing, or of another kind
+    """
+    for key in NEEDED:
+        if key not in found:
+            raise ConfigError(f"{name} is damaged: it has no entry {key}")
+    for key, kinds in KINDS.items():
+        value = found.get(key)
+        if key in found and not (isinstance(value, kinds) or (isinstance(value, dict) and PICKLED in value)):
+            allowed = " or ".join("null" if kind is type(None) else kind.__name__ for kind in kinds)
+            raise ConfigError(f"{name} is damaged: its entry {key} must be {allowed}, got {one_line(repr(value), 100)}")
 
 
 def _has_form(data: object) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from collections.abc import Iterator
 from typing import Any
@@ -14,6 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_tbc.errors import ConfigError
 from sb3_tbc.outside import one_line
 from sb3_tbc.smdp.bounds import RewardRange
 from sb3_tbc.smdp.episode_limit import with_episode_limit
@@ -21,6 +23,7 @@ from sb3_tbc.smdp.faults import watch
 from sb3_tbc.smdp.goal_spaces import check_goal_space
 from sb3_tbc.smdp.goal_test import check_goal_test
 from sb3_tbc.smdp.goal_vec_env import in_goal_vec_env
+from sb3_tbc.smdp.spaces import SubgoalSpace
 from sb3_tbc.tasks.layouts import layout_cure
 from sb3_tbc.tasks.time_limit import declared_limit, time_limit
 from sb3_tbc.tbc_hrl.checks import refuse_vec_normalize
@@ -63,13 +66,35 @@ def in_fitting_vector(env: GymEnv, agent: BaseAlgorithm) -> VecEnv:
     return venv
 
 
+def subgoals_of(env: VecEnv) -> SubgoalSpace | None:
+    """The subgoal space that a task defines; None where it does not.
+
+    :raises ConfigError: if its attribute of this name is something else
+    """
+    found = attribute_of(env, "subgoals")
+    if found is not None and not isinstance(found, SubgoalSpace):
+        raise ConfigError(
+            f"the environment's attribute subgoals must be a SubgoalSpace, got {one_line(repr(found), 100)}; "
+            "SubgoalSpace.from_slices makes one"
+        )
+    return found
+
+
 def reward_range(env: VecEnv) -> RewardRange | None:
-    """Lowest and highest reward of a step, which tasks say as ``reward_range``; None where the environment does not."""
+    """Lowest and highest reward of a step, which tasks say as ``reward_range``; None where the environment does not.
+
+    :raises ConfigError: if what it says is no range
+    """
     said = attribute_of(env, "reward_range")
-    if said is None or not np.all(np.isfinite(said)):
+    if said is None:
         return None
-    low, high = said
-    return RewardRange(float(low), float(high))
+    try:
+        low, high = map(float, said)
+    except (TypeError, ValueError):
+        low, high = math.nan, math.nan
+    if not low <= high:
+        raise ConfigError(f"the environment's reward_range must be (lowest, highest), two numbers, got {said!r}")
+    return RewardRange(low, high) if np.isfinite([low, high]).all() else None
 
 
 def episode_length(env: VecEnv) -> int | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple, cast
 
 import numpy as np
 from stable_baselines3.common.utils import check_for_correct_spaces
@@ -10,10 +10,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_tbc.aliases import Env
 from sb3_tbc.arrays import BoolArray, FloatArray, IntArray
+from sb3_tbc.settings import Range, hints, read
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.goal_spaces import goal_parts
 from sb3_tbc.smdp.guard import GuardedVecEnv
 from sb3_tbc.smdp.options import Episode
+from sb3_tbc.tbc_hrl.arguments import SB3Arguments
 from sb3_tbc.tbc_hrl.checks import refuse_vec_normalize
 from sb3_tbc.tbc_hrl.collection import TwoLevelRunner
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
@@ -71,7 +73,7 @@ def evaluate_flat(
     deterministic: bool = True,
 ) -> EvaluationResult:
     """As :func:`evaluate_hierarchical`, for an agent without subgoals: these figures are NaN, decisions are 0."""
-    given = _vector(env, n_eval_episodes)
+    n_eval_episodes, given = _checked(n_eval_episodes, seed), _vector(env)
     refuse_vec_normalize(given)
     check_for_correct_spaces(given, model.observation_space, model.action_space)
     venv: VecEnv = GuardedVecEnv(with_episode_limit(given), model.on_bad_step)
@@ -108,9 +110,10 @@ def evaluate_hierarchical(
     :param n_eval_episodes: episodes to run
     :param seed: seeds the environments (environment i gets ``seed + i``), for episode-by-episode comparisons
     :param deterministic: use the means of both levels (and the averaged actors)
-    :raises ValueError: if ``n_eval_episodes`` is not positive, or the environment is none that the agent can act in
+    :raises ValueError: if ``n_eval_episodes`` is no number of episodes, ``seed`` is no seed, or the environment is
+        none that the agent can act in
     """
-    venv = _vector(env, n_eval_episodes)
+    n_eval_episodes, venv = _checked(n_eval_episodes, seed), _vector(env)
     refuse_vec_normalize(venv)
     same = goal_parts(venv.observation_space) == goal_parts(model.observation_space)  # it sees nothing else
     if not same or venv.action_space != model.action_space:
@@ -121,9 +124,16 @@ def evaluate_hierarchical(
     return _columns(runner.run(n_eval_episodes, _row))
 
 
-def _vector(env: VecEnv | Env, n_eval_episodes: int) -> VecEnv:
-    if n_eval_episodes < 1:
-        raise ValueError(f"n_eval_episodes must be at least 1, got {n_eval_episodes}")
+def _checked(n_eval_episodes: int, seed: int | None) -> int:
+    """The number of episodes.
+
+    :raises SettingError: if it is none, or the seed is none
+    """
+    read(seed, hints(SB3Arguments)["seed"], "seed")
+    return cast(int, read(n_eval_episodes, Annotated[int, Range(1)], "n_eval_episodes"))
+
+
+def _vector(env: VecEnv | Env) -> VecEnv:
     return env if isinstance(env, VecEnv) else DummyVecEnv([lambda: env])
 
 

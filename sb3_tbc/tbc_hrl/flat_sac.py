@@ -32,7 +32,7 @@ from sb3_tbc.tbc_hrl.averaged_policy import AveragedPolicy
 from sb3_tbc.tbc_hrl.checks import refuse_policy, refuse_vec_normalize, whole_steps, without_sb3_names
 from sb3_tbc.tbc_hrl.config import FlatConfig
 from sb3_tbc.tbc_hrl.diagnostics import record_settings
-from sb3_tbc.tbc_hrl.environment import attribute_of, in_fitting_vector, in_vector
+from sb3_tbc.tbc_hrl.environment import in_fitting_vector, in_vector, subgoals_of
 from sb3_tbc.tbc_hrl.flat_replay import TerminatingHerReplayBuffer
 from sb3_tbc.tbc_hrl.last_step import KeepsLastStep
 from sb3_tbc.tbc_hrl.level_config import learning_rate_of
@@ -143,7 +143,7 @@ class FlatSAC(PlainAlgorithm, KeepsLastStep, SAC):
         :raises ValueError: if it names none
         """
         if self.settings.get("goal_strategy") == "event":
-            check_goal_strategy("event", attribute_of(env, "subgoals"))
+            check_goal_strategy("event", subgoals_of(env))
 
     def _ensure_buffer(self) -> None:
         """Make an empty replay buffer if there is none, as in an agent that was loaded without an environment."""

@@ -154,6 +154,10 @@ class TBCPolicy(BasePolicy):
                 raise ValueError(
                     f"state.{name} is of shape {mine.shape} here, got {np.shape(part)}: is it of another agent?"
                 )
+            if not np.isfinite(part).all():
+                raise NonFiniteError(
+                    f"state.{name} is not finite: {np.asarray(part).tolist()}; predict gives no such state"
+                )
             mine[...] = part
         return clock, own.membrane
 

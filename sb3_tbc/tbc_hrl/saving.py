@@ -21,7 +21,7 @@ from sb3_tbc.files import save_atomic
 from sb3_tbc.settings import SettingError, Settings, hints, plain
 from sb3_tbc.smdp.episode_limit import with_episode_limit
 from sb3_tbc.smdp.faults import named_reset
-from sb3_tbc.tbc_hrl.archive import pickled_keys, policy_of, read_bytes, read_data, unpickled, with_plain
+from sb3_tbc.tbc_hrl.archive import check_entries, pickled_keys, policy_of, read_bytes, read_data, unpickled, with_plain
 from sb3_tbc.tbc_hrl.checks import device_here, without_sb3_names
 from sb3_tbc.tbc_hrl.plain import NotPlainError, encode
 
@@ -178,6 +178,7 @@ class PlainAlgorithm(BaseAlgorithm):
         data, given = read_data(content, name), dict(custom_objects or {})
         cls._check_policy(given.get("policy_class", policy_of(data, trust)), name)
         values = {} if trust else unpickled(data, name, given, env is not None)
+        check_entries({**data, **values, **given}, name)
         changes = cls._changes(kwargs, data)
         now, later = parted(changes)
         try:

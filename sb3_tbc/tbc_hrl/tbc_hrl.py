@@ -38,7 +38,14 @@ from sb3_tbc.tbc_hrl.diagnostics import (
     record_progress,
     record_settings,
 )
-from sb3_tbc.tbc_hrl.environment import attribute_of, episode_length, in_fitting_vector, in_vector, reward_range
+from sb3_tbc.tbc_hrl.environment import (
+    attribute_of,
+    episode_length,
+    in_fitting_vector,
+    in_vector,
+    reward_range,
+    subgoals_of,
+)
 from sb3_tbc.tbc_hrl.foreign_high import put_together
 from sb3_tbc.tbc_hrl.former_settings import take_settings
 from sb3_tbc.tbc_hrl.idle_settings import warn_of_idle_settings
@@ -230,7 +237,7 @@ class TBCHRL(TwoLevelSaving):
         checks.warn_of_unseen(env.observation_space)
         check_goal_test(env)
         if self.subgoals is None:
-            self.subgoals = attribute_of(env, "subgoals")
+            self.subgoals = subgoals_of(env)
         check_goal_strategy(self.config.goal_strategy, self.subgoals)
         if self.subgoals is not None:
             self.subgoals.check_fits(env.observation_space)

@@ -15,7 +15,20 @@ from typing import TYPE_CHECKING
 import torch as th
 
 from sb3_tbc.aliases import Plain, PlainMapping
-from sb3_tbc.commands import INTERRUPTED, Parser, Several, given_path, positive_int, python, run_command, seed_number
+from sb3_tbc.commands import (
+    INTERRUPTED,
+    Parser,
+    Several,
+    env_count,
+    given_path,
+    positive_int,
+    process_count,
+    python,
+    run_command,
+    seed_count,
+    seed_number,
+    step_count,
+)
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.extras import require
 from sb3_tbc.outside import flat_name, folder_name
@@ -67,7 +80,7 @@ def build_parser() -> Parser:
     add("--env", default="Pendulum", help="a task's name or the id of any registered goal environment")
     add("--study-name", help="an existing study is continued; by default <algo>-<task>")
     add("--n-trials", type=positive_int, default=30, help="trials of the whole study, earlier ones included")
-    add("--workers", type=positive_int, default=1, help="processes on this machine")
+    add("--workers", type=process_count, default=1, help="processes on this machine")
     add("--storage", help="journal file (*.log) or any Optuna URL; by default <log-folder>/<study>/journal.log")
     add("--sampler", default="tpe", help="tpe, random, or another of optuna.samplers")
     add("--sampler-seed", type=seed_number, default=0, help="seed of the sampler")
@@ -93,7 +106,7 @@ def build_parser() -> Parser:
         "what all trials share", "fixed when a study begins; not needed when it is continued"
     )
     add = same.add_argument
-    add("--n-seeds", type=positive_int, help="training runs per trial, one per seed (default: 2)")
+    add("--n-seeds", type=seed_count, help="training runs per trial, one per seed (default: 2)")
     add(
         "--first-seed",
         type=seed_number,
@@ -107,8 +120,8 @@ def build_parser() -> Parser:
         help="how the values of the seeds are combined into the trial's (default: mean)",
     )
     add("--threshold", type=float, help="success rate that the objective steps-to-success waits for (default: 0.9)")
-    add("--n-timesteps", type=positive_int, help="environment steps per run; by default the task's")
-    add("--n-envs", type=positive_int, help="parallel environments; by default the configuration's")
+    add("--n-timesteps", type=step_count, help="environment steps per run; by default the task's")
+    add("--n-envs", type=env_count, help="parallel environments; by default the configuration's")
     add("--eval-freq", type=positive_int, help="environment steps between evaluations; by default a fortieth of a run")
     add("--n-eval-episodes", type=positive_int, help="episodes of each evaluation (default: 20)")
     add("--n-final-episodes", type=positive_int, help="episodes of the evaluation after training (default: 20)")

@@ -7,7 +7,6 @@ Nothing here imports Optuna: a space is data, and a trial is any object with ``s
 from __future__ import annotations
 
 import fnmatch
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import resources
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import Protocol, TypeGuard
 
 from sb3_tbc.aliases import Plain, PlainMapping
+from sb3_tbc.arrays import is_finite
 from sb3_tbc.errors import ConfigError, nearest
 from sb3_tbc.reading import SettingsLoader, read_yaml
 from sb3_tbc.settings import merge
@@ -281,7 +281,7 @@ def _range(
 
 
 def _is_number(value: object) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and is_finite(value)
 
 
 def _end(name: str, keys: tuple[str, ...], value: float, where: str) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import time
 import warnings
 from collections.abc import Iterator
@@ -43,6 +44,8 @@ shown = without_password
 JOURNAL_SUFFIXES = (".log", ".journal")
 
 optuna.logging.set_verbosity(optuna.logging.ERROR)
+IN_MEMORY = re.compile(r"sqlite(\+\w+)?:/{2,3}(:memory:)?(\?.*)?")
+"""Databases that end with the connection that began them."""
 
 
 @contextlib.contextmanager
@@ -156,6 +159,11 @@ def open_storage(storage: str, grace: int = 120) -> BaseStorage:
 def _open(storage: str, grace: int) -> BaseStorage:
     retry, interval = RetryHeartbeatStaleTrialCallback(max_retry=MAX_RETRIES), max(1, grace // 4)
     if is_url(storage):
+        if IN_MEMORY.fullmatch(storage):
+            raise ConfigError(
+                f"storage {storage} lives in the memory of one connection, and a search has several: name a file, "
+                "e.g. sqlite:///study.db"
+            )
         database = DatabaseWithHeartbeat(
             storage,
             engine_kwargs={"pool_pre_ping": True},

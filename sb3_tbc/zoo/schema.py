@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from sb3_tbc.aliases import Plain
+from sb3_tbc.commands import MOST_ENVS, MOST_STEPS
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.settings import NotEmpty, Range, SettingError, Settings, hints, read_partial
 from sb3_tbc.tbc_hrl.config import FlatConfig, HACConfig, HiTSConfig, TBCConfig
@@ -44,9 +45,9 @@ class SubgoalKeys(Settings):
 class RunKeys(Settings):
     """Keys that the runner reads itself; all others are settings of the agent."""
 
-    n_timesteps: Annotated[int, Range(1, 10**12)] = 400_000
+    n_timesteps: Annotated[int, Range(1, MOST_STEPS)] = 400_000
     """Environment steps of training."""
-    n_envs: Annotated[int, Range(1, 4096)] = 1
+    n_envs: Annotated[int, Range(1, MOST_ENVS)] = 1
     """Parallel environments."""
     env_kwargs: Plain = field(default_factory=dict)
     """Arguments of ``gymnasium.make``."""

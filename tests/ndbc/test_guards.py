@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_nets import FORMS, SEEDS, random_net
 
+from sb3_tbc import NDBCNet, NDBCWiring
 from sb3_tbc.ndbc.frozen import FrozenNDBC
 
 KINDS = [{"dynamics": "dissipative"}, *FORMS]
@@ -111,3 +113,34 @@ def test_weights_of_another_wiring_are_refused(kind: dict[str, object]) -> None:
     same = random_net(0, spread=0.1, **kind)
     same.load_state_dict(net.state_dict())
     th.testing.assert_close(same(th.ones(1, 3))[0], net(th.ones(1, 3))[0])
+
+
+WIRING = NDBCWiring(3, 4, 4, 2, 2, 2, 1, 2)
+
+
+@pytest.mark.parametrize("name", ["inputs", "state", "mask", "interval"])
+@pytest.mark.parametrize("broken", [lambda x: x.numpy(), lambda x: x.tolist(), lambda x: x.double(), lambda x: x * 1j])
+def test_what_is_no_tensor_of_the_networks_type_is_told(name: str, broken: Callable[[th.Tensor], object]) -> None:
+    net = NDBCNet(3, 2, WIRING)
+    parts = {"inputs": th.zeros(2, 3), "state": net.initial_state(2), "mask": th.ones(2), "interval": th.ones(2)}
+    net(**parts)
+    wrong = broken(parts[name])
+    if name == "mask" and isinstance(wrong, th.Tensor):
+        net(**{**parts, name: wrong})  # only whether it is zero counts
+        return
+    with pytest.raises(TypeError, match=rf"{name} (must be a tensor, got|is of torch\.\w+, the network of)"):
+        net(**{**parts, name: wrong})
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, "a", True])
+def test_seeds_that_are_none(seed: object) -> None:
+    for make in (lambda **k: NDBCWiring(3, 4, 4, 2, 2, 2, 1, 2, **k), lambda **k: NDBCNet(3, 2, WIRING, **k)):
+        with pytest.raises(ValueError, match="seed must be a whole number of at least 0"):
+            make(seed=seed)
+
+
+def test_a_truth_value_is_no_size() -> None:
+    with pytest.raises(ValueError, match="inter must be a whole number"):
+        NDBCWiring(3, True, 4, 2, 2, 2, 1, 2)
+    with pytest.raises(ValueError, match="motor_fanin must be a whole number"):
+        NDBCWiring(3, 4, 4, 2, 2, 2, 1, True)

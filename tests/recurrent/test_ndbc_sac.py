@@ -21,6 +21,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tbc import NDBCSAC
+from sb3_tbc.errors import ConfigError, NonFiniteError
 from sb3_tbc.recurrent.cells import CELLS
 from sb3_tbc.recurrent.sequences import SequenceReplayBuffer, Sequences
 
@@ -444,3 +445,73 @@ def test_learns_what_needs_memory(cell: str) -> None:
     model.learn(3000)
     mean, _ = evaluate_policy(model, make_vec_env(Recall, 2, seed=1), 20)
     assert float(np.mean(mean)) > -0.3
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"batch_size": 0}, "batch_size must be a whole number from 1"),
+        ({"gamma": 1.5}, "gamma must be a number from 0 to 1, got 1.5"),
+        ({"gamma": np.nan}, "gamma must"),
+        ({"tau": 2}, "tau must be a number above 0 and at most 1"),
+        ({"ent_coef": -1}, "ent_coef must"),
+        ({"learning_rate": "x"}, "learning_rate must be a number"),
+        ({"target_update_interval": 0}, "target_update_interval must"),
+        ({"gradient_steps": 1.5}, "gradient_steps must"),
+        ({"seed": -1}, "seed must"),
+        ({"policy_kwargs": {"hidden_size": 0}}, "policy_kwargs.hidden_size must"),
+        ({"policy_kwargs": {"n_critics": 0}}, "policy_kwargs.n_critics must"),
+        (
+            {"replay_buffer_kwargs": {"sequence_length": 8.5}},
+            "burn_in and sequence_length are whole numbers, got 8 and 8.5",
+        ),
+    ],
+)
+def test_values_that_sb3_takes_without_a_word_are_refused(given: dict[str, Any], said: str) -> None:
+    """Of an empty batch, or a discount above one, nothing is learnt; SB3 looks at neither."""
+    with pytest.raises(ConfigError, match=said):
+        NDBCSAC("MlpPolicy", Recall(), **{"buffer_size": 100, **given})
+
+
+def test_a_schedule_and_numbers_of_numpy_are_taken() -> None:
+    NDBCSAC("MlpPolicy", Recall(), lambda left: 1e-3 * left, buffer_size=np.int64(100), gamma=np.float32(0.9))
+
+
+@pytest.mark.parametrize(
+    ("space", "said"),
+    [
+        (spaces.Box(-3, 3, (1,), np.int32), "its actions must be real numbers"),
+        (spaces.Box(-np.inf, np.inf, (1,), np.float32), "its action bounds must be finite"),
+        (spaces.Box(1.0, 1.0, (1,), np.float32), "its lowest actions must be below its highest"),
+    ],
+)
+def test_actions_that_a_squashed_gaussian_cannot_give_are_refused(space: spaces.Box, said: str) -> None:
+    env = Recall()
+    env.action_space = space
+    with pytest.raises(ConfigError, match=f"NDBCSAC cannot act in this environment: {said}"):
+        NDBCSAC("MlpPolicy", env, buffer_size=100)
+
+
+@pytest.mark.parametrize(
+    ("noise", "error", "said"),
+    [
+        (NormalActionNoise(np.zeros(3), np.ones(3)), ConfigError, "action_noise must give 1 numbers, .* got 3"),
+        (NormalActionNoise(np.zeros(1), np.full(1, np.nan)), NonFiniteError, "its action noise is not finite"),
+    ],
+)
+def test_noise_that_does_not_fit_is_called_by_its_name(noise: Any, error: type[Exception], said: str) -> None:
+    model = NDBCSAC("MlpPolicy", Recall(), buffer_size=100, action_noise=noise)
+    with pytest.raises(error, match=said):
+        model.learn(1)
+
+
+def test_a_state_that_is_not_finite_is_named_unless_an_episode_begins() -> None:
+    model = NDBCSAC("MlpPolicy", Recall(), buffer_size=100, seed=0)
+    seen = np.zeros((2, 2), np.float32)
+    _, (memory, last_action) = model.policy.predict(seen)
+    broken = memory.copy()
+    broken[1] = np.nan
+    for state, what in (((broken, last_action), "memory"), ((memory, last_action * np.inf), "last action")):
+        with pytest.raises(NonFiniteError, match=f"environment [01]: its {what} is not finite"):
+            model.predict(seen, state)
+    assert np.isfinite(model.predict(seen, (broken, last_action), np.array([False, True]))[0]).all()

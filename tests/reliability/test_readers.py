@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import time
 from pathlib import Path
 
@@ -72,6 +73,11 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
         path.write_bytes(content)
         with pytest.raises(ConfigError, match=message):
             read_text(path)
+    if os.name == "posix":  # a device has no size, and no end
+        with pytest.raises(ConfigError, match="/dev/zero has more than 100 bytes"):
+            read_text(Path("/dev/zero"), 100)
+    path.write_bytes(b"a\r\nb\rc\n")
+    assert read_text(path) == "a\nb\nc\n"
     with pytest.raises(ConfigError, match="there is no such file"):
         read_text(tmp_path / "missing")
     with pytest.raises(ConfigError, match="cannot read"):
@@ -143,7 +149,7 @@ def test_names_that_windows_keeps_for_devices(text: str) -> None:
     assert folder_name(f"{text[:3]}sole", "the variant")
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), "0.9", True, None, [1], 7, -3])
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 10**400, "0.9", True, None, [1], 7, -3])
 def test_numbers_that_are_none(value: object) -> None:
     with pytest.raises(ConfigError, match="success_rate must"):
         number(value, "success_rate", 0.0, 1.0)

@@ -136,7 +136,7 @@ NONSENSE: dict[str, list[Any]] = {
     "low.gamma": [2, -1, math.inf, True],
     "high.gamma": [1.5, "one", [0.9]],
     "low.batch_size": [0, -1, 2.5, 1e12, "many", True],
-    "high.buffer_size": [0, 1e15, 0.5],
+    "high.buffer_size": [0, 1e15, 0.5, 10**400],
     "low.learning_rate": [0, -1e-3, "cos_1e-3", "lin_", "lin_-1", math.nan, math.inf],
     "low.ent_coef": [-1, "auto_", "auto_0", "automatic"],
     "low.target_entropy": ["low", math.nan],
@@ -185,6 +185,7 @@ NONSENSE: dict[str, list[Any]] = {
     "on_bad_step": ["never", True],
     "hindsight_goals": ["asked"],
     "low.near_misses": [0.5],
+    "high.learning_rate": [10**400],
 }
 
 

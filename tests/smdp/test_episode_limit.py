@@ -13,6 +13,7 @@ from corridor import Corridor
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnvWrapper, VecMonitor
 
+from sb3_tbc import TBCHRL
 from sb3_tbc.errors import ConfigError, EnvironmentFault
 from sb3_tbc.smdp.episode_limit import EpisodeLimit, LastWindow, LimitingVecEnv, with_episode_limit
 from sb3_tbc.smdp.goal_vec_env import GoalVecEnv
@@ -356,3 +357,31 @@ def test_an_environment_that_reuses_its_arrays_keeps_the_last_observation() -> N
             records.append(np.concatenate([episode.observation for episode in episodes]))
     for record in records[1:]:
         np.testing.assert_array_equal(record, records[0])
+
+
+@pytest.mark.parametrize("value", ["no", np.nan, [False], np.array([True, False]), None, 0.5])
+@pytest.mark.parametrize("place", ["terminated", "truncated"])
+def test_ends_are_true_or_false(place: str, value: Any) -> None:
+    """A text, NaN or a list would count as true, and end an episode that goes on."""
+
+    class Vague(Corridor):
+        def step(self, action: Any) -> Any:
+            seen, reward, *ends, info = super().step(action)
+            ends[place == "truncated"] = value
+            return seen, reward, *ends, info
+
+    model = TBCHRL("MultiInputPolicy", Vague(), max_options=5, compile=False, seed=0)
+    with pytest.raises(
+        EnvironmentFault, match=f"environment 0, step 1 of its episode: {place} must be True or False, got"
+    ):
+        model.learn(5)
+
+
+@pytest.mark.parametrize("kind", [bool, np.bool_, int, lambda x: np.array([x])])
+def test_ends_may_be_numbers(kind: Any) -> None:
+    class Numbers(Corridor):
+        def step(self, action: Any) -> Any:
+            seen, reward, terminated, truncated, info = super().step(action)
+            return seen, reward, kind(terminated), kind(truncated), info
+
+    assert TBCHRL("MultiInputPolicy", Numbers(5), max_options=5, compile=False, seed=0).learn(12)._episode_num >= 2

@@ -132,3 +132,25 @@ def test_goals_must_not_be_changed_in_place() -> None:
 )  # fmt: skip
 def test_what_an_info_says_of_success(info: dict[str, Any], said: bool | None) -> None:
     assert said_success(info) is said
+
+
+@pytest.mark.parametrize("answer", ["no", np.nan, 0.3, None])
+@pytest.mark.parametrize("batched", [True, False])
+def test_ends_are_true_or_false(answer: Any, batched: bool) -> None:
+    """A text or NaN would count as an end, nothing as none."""
+
+    class Vague(Corridor):
+        def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+            return np.array([answer] * len(achieved_goal)) if batched and np.ndim(achieved_goal) > 1 else answer
+
+    with pytest.raises(ConfigError, match=r"compute_terminated.* must give True or False for each goal"):
+        check_goal_test(DummyVecEnv([Vague]))
+
+
+@pytest.mark.parametrize("kind", [bool, int, np.float32])
+def test_ends_may_be_numbers(kind: Any) -> None:
+    class Numbers(Corridor):
+        def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+            return np.asarray(super().compute_terminated(achieved_goal, desired_goal, info)).astype(kind)
+
+    check_goal_test(DummyVecEnv([Numbers]))

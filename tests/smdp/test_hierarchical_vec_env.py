@@ -15,7 +15,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_tbc.errors import HierarchyError
+from sb3_tbc.errors import HierarchyError, NonFiniteError
 from sb3_tbc.smdp.hierarchical_vec_env import HierarchicalVecEnv, Proposal
 from sb3_tbc.smdp.hindsight import low_level_steps
 from sb3_tbc.smdp.options import OptionRules, TerminationReason
@@ -185,12 +185,33 @@ def test_environment_without_goals_is_refused() -> None:
         ({"dt_max": 5.0, "dt_min": 6.0}, "dt_min"),
         ({"dt_max": 0.5}, "at least one"),
         ({"dt_max": 5.0, "max_options": 0}, "max_options"),
+        ({"dt_max": 5.0, "max_options": 2.5}, "max_options must be a whole number of at least 1, got 2.5"),
+        ({"dt_max": 5.0, "max_options": True}, "max_options"),
+        ({"dt_max": np.inf}, "dt_max must be a finite number"),
         ({"dt_max": 5.0, "window_end": "sometimes"}, "sometimes"),
     ],
 )
 def test_impossible_rules_are_refused(kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         OptionRules(**kwargs)
+
+
+@pytest.mark.parametrize(
+    ("unit", "testing", "error", "message"),
+    [
+        (np.zeros((1, 2)), np.zeros(2, bool), ValueError, r"2 options need unit actions \(2, 2\).* got \(1, 2\)"),
+        (np.zeros((2, 1)), np.zeros(2, bool), ValueError, r"got \(2, 1\)"),
+        (np.zeros(2), np.zeros(2, bool), ValueError, r"got \(2,\)"),
+        (np.zeros((2, 2)), np.zeros(1, bool), ValueError, r"and testing \(2,\); got \(2, 2\) and \(1,\)"),
+        (np.full((2, 2), np.nan), np.zeros(2, bool), NonFiniteError, "time budgets are not finite"),
+    ],
+)
+def test_proposals_that_are_none_are_refused(unit: Any, testing: Any, error: type[Exception], message: str) -> None:
+    """NumPy would spread a row over all environments; a window whose budget is NaN would never end."""
+    views, venv = LevelViews(Corridor().subgoals, True), DummyVecEnv([Corridor, Corridor])
+    env = HierarchicalVecEnv(venv, lambda *_: Proposal(unit, testing), views, OptionRules(5.0))
+    with pytest.raises(error, match=message):
+        env.reset()
 
 
 def test_a_subgoal_reached_as_the_task_succeeds_counts_as_reached() -> None:

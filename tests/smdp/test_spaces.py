@@ -61,3 +61,34 @@ def test_maps_take_batches() -> None:
                 ValueError, match=rf"achieved map gives .* of \d observations at once, \(\d, {dim}\) is due"
             ):
                 made.check_fits(space)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"low": [-np.inf]}, "bounds must be two vectors of finite numbers"),
+        ({"local_scale": [0.0]}, "local_scale must be a vector of finite numbers above 0"),
+        ({"local_scale": [np.inf]}, "local_scale must"),
+        ({"local_scale": 2.0}, "local_scale must"),
+        ({"groups": [[0.0]]}, "whole numbers"),
+        ({"event": True}, "event must be the index"),
+    ],
+)
+def test_what_would_fail_or_mislead_later_is_refused(given: dict[str, Any], message: str) -> None:
+    usual: dict[str, Any] = {"low": [-1], "high": [1], "thresholds": [0.1], "local_scale": [1.0], "names": ["x"]}
+    SubgoalSpace.from_slices(**usual)
+    with pytest.raises(ValueError, match=message):
+        SubgoalSpace.from_slices(**{**usual, **given})
+
+
+def test_an_event_is_an_entry_of_the_observation() -> None:
+    space = spaces.Dict({"observation": box(4), "achieved_goal": box(1), "desired_goal": box(1)})
+    for event in (3, 4):
+        made = SubgoalSpace.from_slices([-1], [1], [0.1], local_scale=np.ones(4), names=["x"], event=event)
+        if event == 3:
+            made.check_fits(space)
+            continue
+        with pytest.raises(
+            ValueError, match="event is the index of a flag in the observation, which has 4 entries; got 4"
+        ):
+            made.check_fits(space)

@@ -62,3 +62,31 @@ def test_what_no_goal_can_be_reached_in_is_refused_before_sb3_looks_at_it(algori
         algorithm("MultiInputPolicy", endless)
     with pytest.raises(ValueError, match="action bounds must be finite"):
         algorithm("MultiInputPolicy", Corridor()).set_env(endless)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("reward_range", (0, -1), r"reward_range must be \(lowest, highest\), two numbers, got \(0, -1\)"),
+        ("reward_range", (-1, 0, 1), "reward_range must"),
+        ("reward_range", "ab", "reward_range must"),
+        ("reward_range", (np.nan, 0), "reward_range must"),
+        ("max_episode_steps", -5, "max_episode_steps must be a whole number of steps, or None for no limit, got -5"),
+        ("max_episode_steps", 2.5, "max_episode_steps must"),
+        ("max_episode_steps", True, "max_episode_steps must"),
+        ("max_episode_steps", np.inf, "max_episode_steps must"),
+        ("max_episode_steps", "50", "max_episode_steps must"),
+        ("subgoals", [1], r"attribute subgoals must be a SubgoalSpace, got \[1\]"),
+    ],
+)
+def test_what_a_task_says_of_itself_must_make_sense(name: str, value: Any, message: str) -> None:
+    env = Corridor()
+    setattr(env, name, value)
+    with pytest.raises(ValueError, match=message):
+        TBCHRL("MultiInputPolicy", env, compile=False)
+
+
+def test_rewards_without_bounds_are_no_mistake() -> None:
+    env = Corridor()
+    setattr(env, "reward_range", (-np.inf, np.inf))  # noqa: B010 (it has no such attribute)
+    assert TBCHRL("MultiInputPolicy", env, compile=False).reward_range is None

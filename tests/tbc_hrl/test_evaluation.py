@@ -14,6 +14,7 @@ from gymnasium.spaces import Box, Dict
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_tbc import TBCHRL, HiTS
+from sb3_tbc.errors import NonFiniteError
 from sb3_tbc.tbc_hrl.evaluation import evaluate_agent, evaluate_flat, evaluate_hierarchical
 from sb3_tbc.tbc_hrl.flat_sac import FlatSAC
 from sb3_tbc.tbc_hrl.policy import TwoLevelState
@@ -83,7 +84,7 @@ def test_either_kind_of_agent_is_evaluated_as_it_was_asked(flat: bool) -> None:
         other = evaluate(model, Corridor(), 1, seed=7, deterministic=deterministic)
         assert [c.tolist() for c in one[:3]] == [c.tolist() for c in other[:3]]
         assert [c.dtype.kind for c in one] == list("bifffib")
-    with pytest.raises(ValueError, match="n_eval_episodes must be at least 1, got 0"):
+    with pytest.raises(ValueError, match="n_eval_episodes must be a whole number of at least 1, got 0"):
         evaluate_agent(model, Corridor(), 0)
 
 
@@ -150,3 +151,24 @@ def test_a_state_of_other_environments_is_refused() -> None:
         _, state = model.predict(one)
         with pytest.raises(ValueError, match=f"state is {said}"):
             model.predict(other, state)
+    _, state = model.predict(seen)
+    assert state is not None
+    for name in ("time_budget", "elapsed"):
+        broken = TwoLevelState(*state)._replace(**{name: np.full(1, np.nan)})
+        with pytest.raises(NonFiniteError, match=rf"state\.{name} is not finite: \[nan\]"):
+            model.predict(seen, broken)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"n_eval_episodes": 2.5}, "n_eval_episodes must be a whole number of at least 1, got 2.5"),
+        ({"n_eval_episodes": "3"}, "n_eval_episodes must be a whole number of at least 1, got '3'"),
+        ({"seed": -1}, "seed must be a whole number from 0 to 4,294,967,295 or null, got -1"),
+        ({"seed": 1.5}, "seed must be"),
+    ],
+)
+def test_numbers_of_an_evaluation_are_looked_at_first(given: dict[str, Any], message: str) -> None:
+    model = HiTS("MultiInputPolicy", Corridor(), max_options=5, compile=False, seed=0)
+    with pytest.raises(ValueError, match=message):
+        evaluate_hierarchical(model, Corridor(), **given)

@@ -308,6 +308,16 @@ def test_no_episode_begins_badly(agent: TBCHRL, good: int, shape: tuple[int, ...
         act(env) if good else env.reset()
 
 
+def test_options_that_are_none_are_refused(agent: TBCHRL) -> None:
+    env = options(agent)
+    env.reset()
+    for given in (np.zeros((1, 1)), np.zeros((7, 2))):
+        with pytest.raises(ValueError, match="options need unit actions"):
+            env.step(given)
+    with pytest.raises(NonFiniteError, match="the high level's subgoals and time budgets are not finite"):
+        env.step(np.full((env.num_envs, 2), np.nan))
+
+
 def test_what_does_not_fit_is_refused(agent: TBCHRL) -> None:
     high = PPO("MlpPolicy", VecNormalize(options(agent)), n_steps=8, batch_size=8)
     with pytest.raises(ValueError, match="trained behind VecNormalize"):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
+import zipfile
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -168,3 +171,44 @@ def test_odd_arguments_of_loading_and_saving_are_refused_in_one_line(taught: TBC
         TBCHRL.load(saved(taught), device="tpu")  # type: ignore[arg-type]
     with pytest.raises(WriteError, match="it is a folder"):
         taught.save("")
+
+
+def changed(file: io.BytesIO, change: Callable[[dict[str, Any]], object]) -> Any:
+    """The file with another table ``data``."""
+    new = io.BytesIO()
+    with zipfile.ZipFile(file) as old, zipfile.ZipFile(new, "w") as archive:
+        for name in old.namelist():
+            content = old.read(name)
+            if name == "data":
+                data = json.loads(content)
+                change(data)
+                content = json.dumps(data).encode()
+            archive.writestr(name, content)
+    return new
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("policy_kwargs", "x", "its entry policy_kwargs must be dict, got 'x'"),
+        ("num_timesteps", None, "its entry num_timesteps must be int, got None"),
+        ("_owed", [], "its entry _owed must be dict or int or float"),
+        ("subgoals", "x", "its entry subgoals must be SubgoalSpace or null"),
+        ("action_noise", -1, "its entry action_noise must be ActionNoise or null"),
+        ("use_sde", "x", "its entry use_sde must be bool"),
+        ("observation_space", -1, "its entry observation_space must be Space"),
+        ("ep_info_buffer", "x", "its entry ep_info_buffer must be deque or null"),
+    ],
+)
+def test_entries_of_another_kind_are_named(taught: TBCHRL, name: str, value: Any, message: str) -> None:
+    file = changed(saved(taught), lambda data: data.update({name: value}))
+    with pytest.raises(ConfigError, match=f"the agent is damaged: {message}"):
+        TBCHRL.load(file)
+
+
+@pytest.mark.parametrize("name", ["observation_space", "action_space", "policy_class"])
+@pytest.mark.parametrize("trust", [True, False])
+def test_entries_that_are_missing_are_named(taught: TBCHRL, name: str, trust: bool) -> None:
+    file = changed(saved(taught), lambda data: data.pop(name))
+    with pytest.raises(ConfigError, match=f"the agent is damaged: it has no entry {name}"):
+        TBCHRL.load(file, trust=trust)

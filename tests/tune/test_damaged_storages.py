@@ -58,6 +58,14 @@ def test_one_line_or_read(
     assert told > 3
 
 
+@pytest.mark.parametrize("storage", ["sqlite://", "sqlite:///:memory:", "sqlite+pysqlite:///"])
+def test_a_database_in_memory_is_refused(storage: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    assert command.main(["--log-folder", str(tmp_path), "--storage", storage, *SMALL]) == 2
+    said = capfd.readouterr().err.strip()
+    assert f"storage {storage} lives in the memory of one connection" in said
+    assert said.count("\n") == 0
+
+
 def test_a_database_that_fails_during_a_search_is_told_in_one_line(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
