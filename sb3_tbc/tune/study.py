@@ -6,13 +6,14 @@ import contextlib
 import re
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import optuna
+from optuna.distributions import BaseDistribution
 from optuna.storages import BaseStorage, RetryHeartbeatStaleTrialCallback, fail_stale_trials
 from optuna.study import Study
 from optuna.trial import FrozenTrial, TrialState
@@ -349,7 +350,7 @@ def make_sampler(name: str, seed: int | None, stream: tuple[int, ...] = ()) -> o
 
     TPE is multivariate, treats conditional parameters separately, and avoids the values of trials that still run.
 
-    :param seed: seed; with ``stream`` (worker, trials so far) every worker and every resumption draws other numbers
+    :param seed: seed; of another ``stream`` come other numbers
     :raises ConfigError: for an unknown name or one that needs arguments or a package
     """
     known = {n.removesuffix("Sampler").lower(): n for n in optuna.samplers.__all__ if n.endswith("Sampler")}
@@ -359,7 +360,8 @@ def make_sampler(name: str, seed: int | None, stream: tuple[int, ...] = ()) -> o
         raise ConfigError(f"unknown sampler {name!r}; {nearest(key, known)}")
     options: Plain = {}
     if seed is not None:
-        options["seed"] = int(np.random.SeedSequence([seed, *stream]).generate_state(1)[0])
+        own = () if key == "qmc" else stream  # one sequence for all, whose place the storage keeps
+        options["seed"] = int(np.random.SeedSequence([seed, *own]).generate_state(1)[0])
     if key == "tpe":
         options.update(multivariate=True, group=True, constant_liar=True)
     try:
@@ -368,6 +370,46 @@ def make_sampler(name: str, seed: int | None, stream: tuple[int, ...] = ()) -> o
     except (TypeError, ImportError) as error:
         raise ConfigError(f"sampler {name!r} cannot be used by name: {error}; use tpe or random") from error
     return sampler
+
+
+class SamplerOfEachTrial(optuna.samplers.BaseSampler):
+    """Draws each trial from a stream of its own, given by its number, which no two processes share.
+
+    A stream for each process would do only if it knew of all others: the same command on two machines, or given twice,
+    would draw each trial twice.
+
+    :param make: gives the sampler of a trial by its number
+    """
+
+    def __init__(self, make: Callable[[int], optuna.samplers.BaseSampler]) -> None:
+        self._make, self._sampler = make, make(0)
+
+    def before_trial(self, study: optuna.Study, trial: FrozenTrial) -> None:
+        """Begin the stream of a trial."""
+        self._sampler = self._make(trial.number)
+        self._sampler.before_trial(study, trial)
+
+    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        """Which parameters are drawn together."""
+        return self._sampler.infer_relative_search_space(study, trial)
+
+    def sample_relative(
+        self, study: optuna.Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> Plain:
+        """Draw these."""
+        return self._sampler.sample_relative(study, trial, search_space)
+
+    def sample_independent(
+        self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution
+    ) -> object:
+        """Draw a parameter by itself."""
+        return self._sampler.sample_independent(study, trial, param_name, param_distribution)
+
+    def after_trial(
+        self, study: optuna.Study, trial: FrozenTrial, state: TrialState, values: Sequence[float] | None
+    ) -> None:
+        """Let the sampler see how the trial ended."""
+        self._sampler.after_trial(study, trial, state, values)
 
 
 def try_sampler(name: str, settings: StudySettings) -> None:

@@ -30,6 +30,7 @@ from sb3_tbc.tune.study import (
     MAX_RETRIES,
     ORIGIN,
     REASON,
+    SamplerOfEachTrial,
     count_done,
     make_sampler,
     open_storage,
@@ -84,7 +85,7 @@ def load(job: Job, index: int, stop: StopRequest) -> tuple[Study, TrialRunner]:
     """
     study = optuna.load_study(study_name=job.study, storage=open_storage(job.storage, job.grace))
     settings = read_settings(study)
-    study.sampler = make_sampler(job.sampler, job.seed, (index, len(study.get_trials(deepcopy=False))))
+    study.sampler = SamplerOfEachTrial(lambda number: make_sampler(job.sampler, job.seed, (number,)))
     study.pruner = make_pruner(job.pruner, settings.n_evaluations, settings.n_seeds)
     resolve_env(settings.env)  # imports the module that registers it
     options = RunOptions(device=job.device, verbose=0, checkpoint_seconds=math.inf, save_at_end=False, stop=stop)

@@ -6,11 +6,12 @@ from typing import Any
 
 import optuna
 import pytest
+from optuna.storages import BaseStorage
 
 from sb3_tbc.errors import ConfigError
 from sb3_tbc.tune.objectives import ACROSS, OBJECTIVES
 from sb3_tbc.tune.pruning import SEED_VALUES, make_pruner
-from sb3_tbc.tune.study import make_sampler
+from sb3_tbc.tune.study import SamplerOfEachTrial, make_sampler
 from sb3_tbc.zoo.callbacks import EvaluationRow
 
 
@@ -136,9 +137,48 @@ def test_samplers() -> None:
         make_sampler("grid", 0)
 
 
-def test_workers_and_resumptions_draw_different_numbers() -> None:
+def test_streams_draw_different_numbers() -> None:
     drawn = set()
-    for stream in ((0, 0), (1, 0), (0, 7)):
+    for stream in ((0,), (1,), (7,)):
         study = optuna.create_study(sampler=make_sampler("random", 0, stream))
         drawn.add(study.ask().suggest_float("x", 0, 1))
     assert len(drawn) == 3
+
+
+def _search(storage: BaseStorage, seed: int = 0, name: str = "tpe") -> optuna.Study:
+    """A process that opens a study, or joins it."""
+    study = optuna.create_study(study_name="s", storage=storage, load_if_exists=True)
+    study.sampler = SamplerOfEachTrial(lambda number: make_sampler(name, seed, (number,)))
+    return study
+
+
+def _draw(study: optuna.Study) -> tuple[float, float]:
+    trial = study.ask()
+    values = trial.suggest_float("x", 0, 1), trial.suggest_float("y", 0, 1)
+    study.tell(trial, values[0])
+    return values
+
+
+@pytest.mark.parametrize("name", ["tpe", "random", "qmc"])
+def test_processes_that_join_a_study_draw_no_trial_twice(name: str) -> None:
+    """The same command given twice drew each of its first trials twice."""
+    storage = optuna.storages.InMemoryStorage()
+    first, second = _search(storage, name=name), _search(storage, name=name)
+    drawn = [_draw(study) for _ in range(8) for study in (first, second)]
+    assert len(set(drawn)) == 16
+
+
+def test_a_search_is_repeated_by_its_seed() -> None:
+    runs = []
+    for seed in (0, 0, 1):
+        study = _search(optuna.storages.InMemoryStorage(), seed)
+        runs.append([_draw(study) for _ in range(15)])
+    assert runs[0] == runs[1]
+    assert set(runs[0]).isdisjoint(runs[2])
+
+
+def test_a_resumed_search_draws_what_an_undisturbed_one_does() -> None:
+    storage = optuna.storages.InMemoryStorage()
+    whole = _search(optuna.storages.InMemoryStorage())
+    undisturbed = [_draw(whole) for _ in range(14)]
+    assert [_draw(_search(storage)) for _ in range(14)] == undisturbed  # a process of its own for each trial
