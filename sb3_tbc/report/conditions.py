@@ -87,7 +87,7 @@ def differences(runs: Sequence[Run], reference: Sequence[Run]) -> list[str]:
     """Conditions in which a row differs from another, or its seeds from each other: ``name: value (other value)``."""
     found = []
     other = condition_values(reference)
-    own_part = "cuts" in runs[0].method  # what takes them out or puts them in is to differ in them
+    own_part = "cuts" in str(runs[0].final.get("variant"))  # what takes them out or puts them in is to differ in them
     for name, values in condition_values(runs).items():
         if name == CUTS and own_part:
             continue
