@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from numbers import Real
-
 import gymnasium as gym
+import numpy as np
 from gymnasium.wrappers import TimeLimit
 
 from sb3_tbc.aliases import Env
@@ -50,8 +49,10 @@ def _checked(own: object) -> int | None:
     """An environment's own ``max_episode_steps``, where 0 and None stand for no limit."""
     if own is None:
         return None
-    if isinstance(own, bool) or not isinstance(own, Real) or not own >= 0 or own % 1 != 0:
-        raise ValueError(
-            f"the environment's max_episode_steps must be a whole number of steps, or None for no limit, got {own!r}"
-        )
-    return int(own)
+    if isinstance(own, int | float | np.integer | np.floating) and not isinstance(own, bool):
+        steps = float(own)
+        if steps >= 0 and steps.is_integer():  # NaN and infinity are neither
+            return int(steps)
+    raise ValueError(
+        f"the environment's max_episode_steps must be a whole number of steps, or None for no limit, got {own!r}"
+    )
